@@ -1,0 +1,1 @@
+"""Scripted experts, and the recorder that turns their demonstrations into LeRobotDatasets."""

@@ -1,0 +1,54 @@
+"""What an expert hands to the recorder."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+
+class PlanStep(NamedTuple):
+    """One move of a plan.
+
+    Attributes:
+        symbols: the move in words, e.g. `("PICK", "A", "S1", "PLACE", "A", "AUX")`.
+        stop: index of the first waypoint after the move; from that frame on the step is done.
+    """
+
+    symbols: tuple[str, ...]
+    stop: int
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """A motion and the plan behind it.
+
+    Attributes:
+        waypoints: (horizon, action size) float32 actions, in the task's units.
+        steps: the plan, in the order of execution.
+    """
+
+    waypoints: np.ndarray
+    steps: tuple[PlanStep, ...]
+
+    def remaining_symbols(self, frame: int) -> list[str]:
+        """The symbols of the steps that are not yet done at a frame."""
+        return [symbol for step in self.steps if step.stop > frame for symbol in step.symbols]
+
+
+Expert = Callable[[gym.Env, np.random.Generator], Demonstration]
+"""Looks at an environment that was just reset and demonstrates the whole episode; the generator decides between
+equally good choices."""
+
+
+def hold_last_waypoint(waypoints: list[np.ndarray], horizon: int) -> np.ndarray:
+    """Stack waypoints and repeat the last until the horizon is reached: (horizon, action size) float32.
+
+    Raises:
+        ValueError: there are more waypoints than the horizon has room for.
+    """
+    if len(waypoints) > horizon:
+        raise ValueError(f"a demonstration of {len(waypoints)} waypoints does not fit a horizon of {horizon}")
+    padded = waypoints + [waypoints[-1]] * (horizon - len(waypoints))
+    return np.asarray(padded, dtype=np.float32)

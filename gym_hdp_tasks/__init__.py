@@ -1,0 +1,9 @@
+"""Gymnasium tasks that need a long motion and a plan behind it. Importing this package registers their ids."""
+
+import gymnasium as gym
+
+from .task import PAD, PlanningTask
+
+__all__ = ["PAD", "PlanningTask"]
+
+gym.register(id="hdp/BlockSorting2D-v0", entry_point="gym_hdp_tasks.block_sorting_2d:BlockSorting2DEnv")

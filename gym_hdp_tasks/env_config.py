@@ -1,0 +1,79 @@
+"""`--env.type=hdp`: LeRobot's view of the tasks."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from .block_sorting_2d import block_sorting_2d_task
+from .task import PlanningTask
+
+TASKS: dict[str, Callable[..., PlanningTask]] = {"BlockSorting2D-v0": block_sorting_2d_task}
+"""Task name, as in `--env.task=`, to the function that states the task's facts."""
+
+
+@EnvConfig.register_subclass("hdp")
+@dataclass
+class HDPEnv(EnvConfig):
+    """Configuration of a task of this package.
+
+    Attributes:
+        task: one of `TASKS`.
+        n_blocks: number of blocks (BlockSorting2D only).
+        waypoints_per_pose: waypoints between two key poses of the expert, which sets the episode's length
+            (BlockSorting2D only).
+    """
+
+    task: str | None = "BlockSorting2D-v0"
+    n_blocks: int = 3
+    waypoints_per_pose: int = 3
+    render_mode: str = "rgb_array"
+
+    def __post_init__(self):
+        task = self.planning_task
+        self.fps = task.fps
+        self.features = {
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(len(task.state_names),)),
+            "environment_state": PolicyFeature(
+                type=FeatureType.ENV, shape=(len(task.environment_state_names),)
+            ),
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(task.action_names),)),
+        }
+        self.features_map = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE, ACTION: ACTION}
+
+    @property
+    def planning_task(self) -> PlanningTask:
+        """The facts of the configured task.
+
+        Raises:
+            ValueError: there is no such task, or it cannot have these parameters.
+        """
+        if self.task not in TASKS:
+            raise ValueError(f"--env.task={self.task} is not a task of --env.type=hdp; choose one of {list(TASKS)}")
+        return TASKS[self.task](**self._task_parameters)
+
+    @property
+    def _task_parameters(self) -> dict[str, Any]:
+        if self.task == "BlockSorting2D-v0":
+            return {"n_blocks": self.n_blocks, "waypoints_per_pose": self.waypoints_per_pose}
+        return {}
+
+    @property
+    def package_name(self) -> str:
+        return "gym_hdp_tasks"
+
+    @property
+    def gym_id(self) -> str:
+        return f"hdp/{self.task}"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        return {"render_mode": self.render_mode, **self._task_parameters}
+
+    @classmethod
+    def default_choice_name(cls) -> str:
+        """Where only these tasks make sense (`hdp-record`), `--env.type=hdp` can be left out."""
+        return "hdp"
