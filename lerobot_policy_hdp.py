@@ -1,4 +1,7 @@
-"""What LeRobot's plugin discovery imports: registers the policy and the environment configs, nothing else."""
+"""What LeRobot's plugin discovery imports: registers the policy and the environment configs, and keeps logs short."""
 
-import gym_hdp_tasks.env_config
+import gym_hdp_tasks.env_config  # noqa: F401
 import lerobot_hdp.configuration_hdp  # noqa: F401
+from lerobot_hdp.torchcodec_warning import shorten_torchcodec_warning
+
+shorten_torchcodec_warning()

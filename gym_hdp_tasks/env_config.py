@@ -37,9 +37,7 @@ class HDPEnv(EnvConfig):
         self.fps = task.fps
         self.features = {
             "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(len(task.state_names),)),
-            "environment_state": PolicyFeature(
-                type=FeatureType.ENV, shape=(len(task.environment_state_names),)
-            ),
+            "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(len(task.environment_state_names),)),
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(task.action_names),)),
         }
         self.features_map = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE, ACTION: ACTION}

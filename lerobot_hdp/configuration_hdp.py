@@ -1,0 +1,218 @@
+"""Everything that can be set about the planner."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+from lerobot.utils.constants import OBS_PREFIX
+
+OBS_SYMBOLIC_PLAN = f"{OBS_PREFIX}symbolic_plan"
+"""Dataset column with the plan's token ids; from an environment, the plan's prompt. It has this name because LeRobot
+keeps only `observation.*` columns."""
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # What measures best.
+    "default": {
+        "prediction_type": "sample",
+        "dropout": 0.0,
+        "optimizer_lr": 1e-3,
+        "scheduler_warmup_steps": 100,
+    },
+    # The paper's values (Table "Transformer architecture hyperparameters" and those of Diffusion Policy, on which
+    # it builds). Its symbolic horizon is longer than a plan needs: set `symbolic_horizon` to the table's H_d.
+    "paper": {
+        "prediction_type": "epsilon",
+        "dropout": 0.3,
+        "optimizer_lr": 1e-4,
+        "scheduler_warmup_steps": 1000,
+    },
+}
+"""Values of the fields that are None until a preset fills them."""
+
+
+@PreTrainedConfig.register_subclass("hdp")
+@dataclass
+class HDPConfig(PreTrainedConfig):
+    """Configuration of the Hybrid Diffusion Planner.
+
+    What the planner needs to know of the data comes from the dataset: sizes, vocabulary, normalisation. Only the
+    horizon has to be said, because LeRobot asks for it before it opens the dataset.
+
+    Attributes:
+        preset: `default` (measures best) or `paper` (the paper's values). It fills the fields below that are None;
+            what is set explicitly stays.
+
+        horizon: number of actions in a plan (H_c): the length of the dataset's episodes.
+        symbolic_horizon: number of tokens in a plan (H_d). None: that of the dataset. Longer: filled with PAD.
+        n_action_steps: actions that are executed before the next plan is made. None: the whole plan, open loop.
+        plan_from: `episode_start` trains on the whole plan at the first frame of each episode, which must all be
+            `horizon` frames long; `any_frame` on what remains of the plan at any frame, held at its end.
+        plan_symbols: False models the motion alone, which is Diffuser (Janner et al. 2022).
+        vocabulary: the symbols, PAD first; read from the dataset.
+
+        num_layers, num_heads, width, dropout: the transformer; `width` is the size of a token.
+        num_train_timesteps: N, steps of the Gaussian process.
+        prediction_type: what is predicted of the motion: `epsilon` (the noise), `sample` (the clean motion) or
+            `v_prediction`.
+        symbol_loss_weight: lambda, weight of the symbols' loss beside the motion's.
+        ema_power, ema_max_decay: the weights that plan are an exponential moving average with the decay
+            min(1 - (1 + update)^-ema_power, ema_max_decay), as in Diffusion Policy. `ema_max_decay` 0 switches it off.
+
+        sampler: `ddpm` draws noise in every step, `ddim` only at the start.
+        num_inference_steps: network calls for a plan. None: N.
+
+        compile_model, compile_mode: run the denoiser through `torch.compile`.
+        dtype: `float32`, or `bfloat16` for autocast in training and planning.
+
+        optimizer_*, scheduler_*: AdamW with a linear warm-up and a cosine decay to the last step.
+    """
+
+    preset: str = "default"
+
+    horizon: int | None = None
+    symbolic_horizon: int | None = None
+    n_action_steps: int | None = None
+    plan_from: str = "episode_start"
+    plan_symbols: bool = True
+    vocabulary: list[str] | None = None
+
+    num_layers: int = 8
+    num_heads: int = 4
+    width: int = 256
+    dropout: float | None = None
+    num_train_timesteps: int = 100
+    prediction_type: str | None = None
+    symbol_loss_weight: float = 1 / 30
+    ema_power: float = 0.75
+    ema_max_decay: float = 0.9999
+
+    sampler: str = "ddpm"
+    num_inference_steps: int | None = None
+
+    compile_model: bool = False
+    compile_mode: str = "default"
+    dtype: str = "float32"
+
+    optimizer_lr: float | None = None
+    optimizer_betas: tuple[float, float] = (0.9, 0.95)
+    optimizer_eps: float = 1e-8
+    optimizer_weight_decay: float = 1e-3
+    optimizer_grad_clip_norm: float = 10.0
+    scheduler_warmup_steps: int | None = None
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.MEAN_STD,
+            "STATE": NormalizationMode.MIN_MAX,
+            "ENV": NormalizationMode.MIN_MAX,
+            "ACTION": NormalizationMode.MIN_MAX,
+        }
+    )
+
+    def __post_init__(self):
+        super().__post_init__()
+        _check_choice("preset", self.preset, list(PRESETS))
+        for name, value in PRESETS[self.preset].items():
+            if getattr(self, name) is None:
+                setattr(self, name, value)
+        _check_choice("plan_from", self.plan_from, ["episode_start", "any_frame"])
+        _check_choice("prediction_type", self.prediction_type, ["epsilon", "sample", "v_prediction"])
+        _check_choice("sampler", self.sampler, ["ddpm", "ddim"])
+        _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
+        if self.n_obs_steps != 1:
+            raise ValueError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
+        if self.width % self.num_heads or self.width % 2:
+            raise ValueError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
+        for name in ("horizon", "symbolic_horizon", "n_action_steps", "num_inference_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        if self.horizon and self.n_action_steps and self.n_action_steps > self.horizon:
+            raise ValueError(f"n_action_steps={self.n_action_steps} is more than the plan has ({self.horizon=})")
+        if self.num_inference_steps and self.num_inference_steps > self.num_train_timesteps:
+            raise ValueError(f"num_inference_steps={self.num_inference_steps} is more than {self.num_train_timesteps=}")
+
+    def set_dataset_feature_metadata(self, features: dict[str, dict]) -> None:
+        """Take over what the dataset says about its symbolic plans. LeRobot calls this before it builds the policy.
+
+        Raises:
+            ValueError: the dataset has no symbolic plans, they do not fit, or they speak another vocabulary.
+        """
+        self.input_features.pop(OBS_SYMBOLIC_PLAN, None)  # token ids are no numbers to normalise
+        if not self.plan_symbols:
+            return
+        if OBS_SYMBOLIC_PLAN not in features:
+            raise ValueError(
+                f"the dataset has no column '{OBS_SYMBOLIC_PLAN}'. Add one (README, 'Your own dataset'), or train "
+                "on the motion alone with --policy.plan_symbols=false."
+            )
+        feature = features[OBS_SYMBOLIC_PLAN]
+        symbols = (feature.get("info") or {}).get("vocabulary")
+        if not symbols:
+            raise ValueError(f"meta/info.json names no vocabulary under features['{OBS_SYMBOLIC_PLAN}']['info']")
+        if self.vocabulary is not None and list(symbols) != list(self.vocabulary):
+            raise ValueError(
+                f"the dataset's vocabulary {' '.join(symbols)} is not the checkpoint's {' '.join(self.vocabulary)}"
+            )
+        self.vocabulary = list(symbols)
+        plan_length = feature["shape"][0]
+        if self.symbolic_horizon is None:
+            self.symbolic_horizon = plan_length
+        elif self.symbolic_horizon < plan_length:
+            raise ValueError(
+                f"symbolic_horizon={self.symbolic_horizon} is shorter than the dataset's plans of {plan_length} tokens"
+            )
+
+    def validate_features(self) -> None:
+        if self.image_features:
+            raise ValueError(
+                f"the planner takes no images yet; leave out {list(self.image_features)} with --policy.input_features"
+            )
+        if not self.input_features:
+            raise ValueError("the planner needs at least one of observation.state and observation.environment_state")
+        if self.action_feature is None:
+            raise ValueError("the dataset has no column 'action'")
+        if self.plan_symbols and not (self.vocabulary and self.symbolic_horizon):
+            raise ValueError("vocabulary and symbolic_horizon are unknown: train on a dataset with symbolic plans")
+
+    @property
+    def drop_n_last_frames(self) -> int:
+        """Frames at an episode's end that no training sample starts from: for LeRobot's sampler."""
+        return self._known_horizon - 1 if self.plan_from == "episode_start" else 0
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self._known_horizon))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+    @property
+    def _known_horizon(self) -> int:
+        if self.horizon is None:
+            raise ValueError("--policy.horizon is missing: the number of frames of the dataset's episodes")
+        return self.horizon
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            eps=self.optimizer_eps,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:
+        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+
+def _check_choice(name: str, value: Any, choices: list[str]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {choices}, got {value!r}")

@@ -1,0 +1,356 @@
+"""`hdp-record`: let an expert demonstrate a task and write a LeRobotDataset.
+
+The dataset is recorded in shards of a few episodes, each a finished LeRobotDataset, by one or several processes, and
+merged at the end. So an interrupted recording goes on where it stopped, and the result does not depend on the number
+of processes: every episode has a seed of its own.
+"""
+
+import json
+import logging
+import multiprocessing
+import shutil
+import signal
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field
+from itertools import count
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import datasets
+import gymnasium as gym
+import numpy as np
+from lerobot.configs import parser
+from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.io_utils import load_info, write_info
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import create_lerobot_dataset_card
+from lerobot.utils.constants import ACTION, DONE, HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_STATE, REWARD
+from tqdm import tqdm
+
+import gym_hdp_tasks  # noqa: F401 (registers the tasks)
+from gym_hdp_tasks import PlanningTask
+from gym_hdp_tasks.env_config import HDPEnv
+
+from .demonstration import Demonstration, Expert
+from .experts import EXPERTS
+
+SYMBOLIC_PLAN = "observation.symbolic_plan"
+SUCCESS = "next.success"
+EPISODES_PER_SHARD = 25
+
+
+@dataclass
+class RecordDatasetConfig:
+    """What is recorded and where it goes.
+
+    Attributes:
+        repo_id: name of the dataset, `{hf_user}/{dataset_name}`.
+        root: folder of the dataset. None: `$HF_LEROBOT_HOME/{repo_id}`.
+        num_episodes: how many demonstrations.
+        push_to_hub: upload the dataset, with a card, when it is done.
+        private: upload to a private repository. None: what the organisation's default is.
+        tags: more tags for the card.
+    """
+
+    repo_id: str
+    root: Path | None = None
+    num_episodes: int = 200
+    push_to_hub: bool = False
+    private: bool | None = None
+    tags: list[str] = field(default_factory=list)
+
+
+@dataclass
+class RecordConfig:
+    """Options of `hdp-record`.
+
+    Attributes:
+        dataset: what is recorded and where it goes.
+        env: the task, as for `lerobot-eval`.
+        seed: every start and every choice of the expert follow from it.
+        num_workers: processes that record.
+        resume: go on with a recording that was interrupted.
+    """
+
+    dataset: RecordDatasetConfig
+    env: HDPEnv = field(default_factory=HDPEnv)
+    seed: int = 0
+    num_workers: int = 1
+    resume: bool = False
+
+    def __post_init__(self):
+        if self.dataset.num_episodes < 1 or self.num_workers < 1:
+            raise ValueError("--dataset.num_episodes and --num_workers must be at least 1")
+
+    @property
+    def root(self) -> Path:
+        return Path(self.dataset.root or HF_LEROBOT_HOME / self.dataset.repo_id)
+
+
+class Episode(NamedTuple):
+    """A demonstration as it was executed; the arrays have one row for each frame."""
+
+    columns: dict[str, np.ndarray]
+    symbols: list[str]
+    score: float
+
+
+class Shard(NamedTuple):
+    """A part of a recording: the episodes from `start` to before `stop`."""
+
+    root: Path
+    start: int
+    stop: int
+
+    @property
+    def done_file(self) -> Path:
+        """Exists when everything that the shard's folder holds was flushed to disk."""
+        return self.root.with_suffix(".done")
+
+
+def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
+    """The environment's seed for an episode of a recording; a failed attempt is followed by another one.
+
+    Far from the small numbers that evaluations start from, so that no policy is evaluated on a start it was trained
+    on.
+    """
+    return int(np.random.SeedSequence([seed, episode, attempt]).generate_state(1)[0])
+
+
+def demonstrate(env: gym.Env, expert: Expert, seed: int) -> Episode:
+    """Reset the environment, let the expert plan, and execute its plan to the end."""
+    observation, _ = env.reset(seed=seed)
+    demonstration = expert(env, np.random.default_rng(seed))
+    task: PlanningTask = env.unwrapped.planning_task  # type: ignore[attr-defined]
+    frames, score = [], 0.0
+    for frame, action in enumerate(demonstration.waypoints):
+        next_observation, score, terminated, truncated, info = env.step(action)
+        frames.append(
+            {
+                OBS_STATE: observation["agent_pos"],
+                OBS_ENV_STATE: observation["environment_state"],
+                ACTION: action,
+                SYMBOLIC_PLAN: remaining_token_ids(demonstration, frame, task),
+                REWARD: np.float32([score]),
+                SUCCESS: np.array([info["is_success"]]),
+                DONE: np.array([terminated or truncated]),
+            }
+        )
+        observation = next_observation
+    columns = {key: np.stack([frame[key] for frame in frames]) for key in frames[0]}
+    return Episode(columns, demonstration.remaining_symbols(0), float(score))
+
+
+def remaining_token_ids(demonstration: Demonstration, frame: int, task: PlanningTask) -> np.ndarray:
+    """Token ids of what remains of the plan at a frame, filled with PAD: (symbolic_horizon,) int64."""
+    ids = [task.vocabulary.index(symbol) for symbol in demonstration.remaining_symbols(frame)]
+    return np.array(ids + [0] * (task.symbolic_horizon - len(ids)), dtype=np.int64)
+
+
+def dataset_features(task: PlanningTask, seed: int) -> dict[str, dict[str, Any]]:
+    """The columns of a task's dataset. What explains it travels in the symbolic plan's `info`."""
+
+    def column(dtype: str, names: tuple[str, ...] | None, size: int | None = None, **more) -> dict[str, Any]:
+        return {"dtype": dtype, "shape": (size or len(names),), "names": list(names) if names else None, **more}
+
+    return {
+        OBS_STATE: column("float32", task.state_names),
+        OBS_ENV_STATE: column("float32", task.environment_state_names),
+        ACTION: column("float32", task.action_names),
+        SYMBOLIC_PLAN: column(
+            "int64",
+            None,
+            task.symbolic_horizon,
+            info={
+                "vocabulary": list(task.vocabulary),
+                "gym_id": task.gym_id,
+                "parameters": task.parameters,
+                "seed": seed,
+            },
+        ),
+        REWARD: column("float32", None, 1),
+        SUCCESS: column("bool", None, 1),
+        DONE: column("bool", None, 1),
+    }
+
+
+def record_episodes(config: RecordConfig, episodes: range) -> Iterator[tuple[Episode, int]]:
+    """Successful episodes in order, each with the number of attempts that failed before it."""
+    env = gym.make(config.env.gym_id, disable_env_checker=True, **config.env.gym_kwargs)
+    expert = EXPERTS[config.env.gym_id]
+    try:
+        for index in episodes:
+            for attempt in count():
+                episode = demonstrate(env, expert, episode_seed(config.seed, index, attempt))
+                if episode.columns[SUCCESS][-1]:
+                    yield episode, attempt
+                    break
+    finally:
+        env.close()
+
+
+def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = None) -> dict[int, int]:
+    """Record a shard, or what is missing of it. What is finished stays, whatever interrupts.
+
+    Returns:
+        How many attempts failed, for the episodes that needed more than one.
+    """
+    datasets.disable_progress_bars()  # one for every episode otherwise
+    task = config.env.planning_task
+    if shard.root.exists() and not shard.done_file.exists():
+        shutil.rmtree(shard.root)  # killed while it was written: its files have no footers
+    if shard.root.exists():
+        failed = {int(k): v for k, v in json.loads(shard.done_file.read_text()).items()}
+        dataset = LeRobotDataset.resume(config.dataset.repo_id, root=shard.root, video_backend="pyav")
+    else:
+        failed = {}
+        dataset = LeRobotDataset.create(
+            config.dataset.repo_id,
+            fps=task.fps,
+            features=dataset_features(task, config.seed),
+            root=shard.root,
+            robot_type=task.robot_type,
+            use_videos=False,
+            video_backend="pyav",
+        )
+    shard.done_file.unlink(missing_ok=True)
+    start = shard.start + dataset.meta.total_episodes
+    try:
+        for index, (episode, attempts) in enumerate(record_episodes(config, range(start, shard.stop)), start):
+            for frame in range(len(episode.columns[ACTION])):
+                row = {key: column[frame] for key, column in episode.columns.items()}
+                dataset.add_frame({**row, "task": task.instruction})
+            dataset.save_episode()
+            if attempts:
+                failed[index] = attempts
+            if progress is not None:
+                progress.update()
+    finally:
+        dataset.finalize()
+        if dataset.meta.total_episodes:
+            shard.done_file.write_text(json.dumps(failed))
+        else:
+            shutil.rmtree(shard.root)
+    return failed
+
+
+def record(config: RecordConfig) -> LeRobotDataset:
+    """Record a dataset as the configuration says.
+
+    Raises:
+        FileExistsError: the dataset's folder exists, or an interrupted recording does and `resume` is not set.
+        ValueError: the interrupted recording had other settings.
+    """
+    root, shards = config.root, plan_shards(config)
+    failed: dict[int, int] = {}
+    with tqdm(total=config.dataset.num_episodes, desc="Recording", unit="episode") as progress:
+        if config.num_workers == 1:
+            for shard in shards:
+                if is_complete(shard):
+                    progress.update(shard.stop - shard.start)
+                failed |= record_shard(config, shard, progress)
+        else:
+            context = multiprocessing.get_context("forkserver")
+            with ProcessPoolExecutor(config.num_workers, mp_context=context) as executor:
+                futures = {executor.submit(record_shard, config, shard): shard for shard in shards}
+                for future in as_completed(futures):
+                    failed |= future.result()
+                    progress.update(futures[future].stop - futures[future].start)
+
+    dataset = merge_shards(config, shards, failed)
+    dropped, attempts = sum(failed.values()), config.dataset.num_episodes + sum(failed.values())
+    print(f"{dataset.num_episodes} episodes in {root}; dropped {dropped} of {attempts} demonstrations that failed")
+    if config.dataset.push_to_hub:
+        dataset.push_to_hub(
+            tags=[*CARD_TAGS, *config.dataset.tags],
+            private=config.dataset.private,
+            dataset_description=describe(config.env.planning_task, dataset),
+        )
+    return dataset
+
+
+def plan_shards(config: RecordConfig) -> list[Shard]:
+    """The shards of a recording, in a folder beside the dataset's that remembers the settings."""
+    partial = config.root.with_name(config.root.name + ".partial")
+    if config.root.exists():
+        raise FileExistsError(f"{config.root} exists already: delete it, or choose another --dataset.root")
+    settings = {"env": asdict(config.env), "seed": config.seed, "num_episodes": config.dataset.num_episodes}
+    settings = json.loads(json.dumps(settings, default=str))
+    settings_file = partial / "settings.json"
+    if partial.exists() and not config.resume:
+        raise FileExistsError(f"{partial} holds an interrupted recording: go on with --resume=true, or delete it")
+    if settings_file.exists() and json.loads(settings_file.read_text()) != settings:
+        raise ValueError(f"{settings_file} has other settings than this command: use the same ones to resume")
+    partial.mkdir(parents=True, exist_ok=True)
+    settings_file.write_text(json.dumps(settings, indent=2))
+    total = config.dataset.num_episodes
+    starts = range(0, total, EPISODES_PER_SHARD)
+    return [Shard(partial / f"episodes_{start:06d}", start, min(start + EPISODES_PER_SHARD, total)) for start in starts]
+
+
+def is_complete(shard: Shard) -> bool:
+    """Whether a shard holds all of its episodes."""
+    return shard.done_file.exists() and load_info(shard.root).total_episodes == shard.stop - shard.start
+
+
+def merge_shards(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) -> LeRobotDataset:
+    """Make one dataset of the shards and remove them."""
+    partial = shards[0].root.parent
+    merged = partial / "merged"
+    shutil.rmtree(merged, ignore_errors=True)
+    repo_id = config.dataset.repo_id
+    aggregate_datasets([repo_id] * len(shards), repo_id, roots=[shard.root for shard in shards], aggr_root=merged)
+
+    info = load_info(merged)
+    info.features[SYMBOLIC_PLAN]["info"]["failed_attempts"] = {str(k): v for k, v in sorted(failed.items())}
+    write_info(info, merged)
+    dataset = LeRobotDataset(repo_id, root=merged, video_backend="pyav")
+    card = create_lerobot_dataset_card(
+        tags=[*CARD_TAGS, *config.dataset.tags],
+        dataset_info=info,
+        license="apache-2.0",
+        dataset_description=describe(config.env.planning_task, dataset),
+    )
+    card.save(merged / "README.md")
+    config.root.parent.mkdir(parents=True, exist_ok=True)
+    merged.rename(config.root)
+    shutil.rmtree(partial)
+    return LeRobotDataset(repo_id, root=config.root, video_backend="pyav")
+
+
+CARD_TAGS = ["hybrid-diffusion-planning", "symbolic-plan", "simulation"]
+
+
+def describe(task: PlanningTask, dataset: LeRobotDataset) -> str:
+    """The dataset card's description, with the plan of the first episode in words."""
+    ids = dataset.hf_dataset[0][SYMBOLIC_PLAN].tolist()
+    words = " ".join(task.vocabulary[i] for i in ids if i)
+    return (
+        f"{dataset.num_episodes} demonstrations of `{task.gym_id}` by a scripted expert: {task.instruction}\n\n"
+        f"Each episode has {task.horizon} frames. `{SYMBOLIC_PLAN}` holds, at every frame, the token ids of the plan "
+        f"that remains, filled with PAD. The whole plan of episode 0, in words:\n\n> {words}\n\n"
+        f"The vocabulary, in the order of the ids: {', '.join(f'`{symbol}`' for symbol in task.vocabulary)}."
+    )
+
+
+@parser.wrap()
+def _main(config: RecordConfig) -> None:
+    record(config)
+
+
+def main() -> None:
+    """Entry point of `hdp-record`: bad input is one line on stderr and exit status 1."""
+    logging.getLogger("lerobot").setLevel(logging.WARNING)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("hdp-record: terminated; go on with --resume=true"))
+    try:
+        _main()
+    except KeyboardInterrupt:
+        sys.exit("hdp-record: interrupted; go on with --resume=true")
+    except (ValueError, FileExistsError) as error:
+        sys.exit(f"hdp-record: {error}")
+
+
+if __name__ == "__main__":
+    main()

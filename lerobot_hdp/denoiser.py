@@ -1,0 +1,140 @@
+"""D_theta: one transformer that denoises the motion and the symbols together (paper, Fig. "Architecture")."""
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class Prediction(NamedTuple):
+    """What the denoiser says about a corrupted plan.
+
+    Attributes:
+        motion: (B, H_c, D) the noise, the clean motion or v, as the Gaussian process was told.
+        logits: (B, H_d, m) scores of the m symbols; there is none for the mask, whose probability is zero. None
+            where no symbols are modelled.
+    """
+
+    motion: Tensor
+    logits: Tensor | None
+
+
+class SinusoidalEmbedding(nn.Module):
+    """Sines and cosines of a diffusion step: (B,) -> (B, width)."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        half = width // 2
+        self.register_buffer(
+            "frequencies", torch.exp(-math.log(10_000) * torch.arange(half) / (half - 1)), persistent=False
+        )
+
+    def forward(self, step: Tensor) -> Tensor:
+        angles = step[:, None] * self.frequencies
+        return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+class Denoiser(nn.Module):
+    """(motion prediction, token logits) = D_theta(A_c, A_d, O, k_c, k_d).
+
+    Diffusion Policy's transformer (Chi et al. 2023): the plan's tokens attend to each other, without a causal mask,
+    and to the condition tokens. Motion and symbols are embedded by a linear layer each and concatenated in time, so
+    that modelling symbols adds only their embedding, that of k_d, and a head.
+
+    Args:
+        action_dim: D.
+        horizon: H_c.
+        observation_tokens: number of condition tokens that the observation is encoded into.
+        num_train_timesteps: N; k_c is embedded as a training step.
+        vocabulary_size: m.
+        symbolic_horizon: H_d; 0 models the motion alone (Diffuser).
+        num_layers, num_heads, width, dropout: of the transformer. Dropout acts in attention and feed-forward layers.
+    """
+
+    def __init__(
+        self,
+        action_dim: int,
+        horizon: int,
+        observation_tokens: int,
+        num_train_timesteps: int,
+        vocabulary_size: int,
+        symbolic_horizon: int,
+        num_layers: int,
+        num_heads: int,
+        width: int,
+        dropout: float,
+    ):
+        super().__init__()
+        self.horizon = horizon
+        self.num_train_timesteps = num_train_timesteps
+        self.vocabulary_size = vocabulary_size
+        self.models_symbols = symbolic_horizon > 0
+
+        self.embed_motion = nn.Linear(action_dim, width)
+        self.embed_motion_level = SinusoidalEmbedding(width)
+        self.motion_head = nn.Linear(width, action_dim)
+        if self.models_symbols:
+            self.embed_symbols = nn.Linear(vocabulary_size + 1, width)  # one-hot, with the mask as one more state
+            self.embed_symbol_level = nn.Sequential(nn.Linear(1, width), nn.Mish(), nn.Linear(width, width))
+            self.symbol_head = nn.Linear(width, vocabulary_size)
+        self.positions = nn.Parameter(torch.empty(1, horizon + symbolic_horizon, width))
+
+        condition_tokens = 1 + int(self.models_symbols) + observation_tokens
+        self.condition_positions = nn.Parameter(torch.empty(1, condition_tokens, width))
+        self.condition_encoder = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        layer = nn.TransformerDecoderLayer(
+            width, num_heads, 4 * width, dropout, activation="gelu", batch_first=True, norm_first=True
+        )
+        self.decoder = nn.TransformerDecoder(layer, num_layers, norm=nn.LayerNorm(width))
+        self.apply(_initialise)
+        nn.init.normal_(self.positions, std=0.02)
+        nn.init.normal_(self.condition_positions, std=0.02)
+
+    def forward(
+        self, motion: Tensor, tokens: Tensor | None, observation: Tensor, motion_level: Tensor, symbol_level: Tensor
+    ) -> Prediction:
+        """Predict the clean plan behind a corrupted one.
+
+        Args:
+            motion: (B, H_c, D) noisy motion A_c.
+            tokens: (B, H_d) partly masked token ids A_d; ignored where no symbols are modelled.
+            observation: (B, n, width) encoded observation O.
+            motion_level: (B,) k_c in [0, 1].
+            symbol_level: (B,) k_d in [0, 1].
+        """
+        # A clean motion (k_c = 0) is shown at the lowest level of training, whose noise is next to none.
+        step = (motion_level * self.num_train_timesteps - 1).clamp(min=0)
+        plan, levels = [self.embed_motion(motion)], [self.embed_motion_level(step)]
+        if self.models_symbols:
+            one_hot = F.one_hot(tokens, self.vocabulary_size + 1).to(self.embed_symbols.weight.dtype)
+            plan.append(self.embed_symbols(one_hot))
+            levels.append(self.embed_symbol_level(symbol_level[:, None]))
+
+        condition = torch.cat([torch.stack(levels, dim=1), observation], dim=1) + self.condition_positions
+        memory = self.condition_encoder(condition)
+        hidden = self.decoder(torch.cat(plan, dim=1) + self.positions, memory)
+
+        motion_prediction = self.motion_head(hidden[:, : self.horizon])
+        logits = self.symbol_head(hidden[:, self.horizon :]) if self.models_symbols else None
+        return Prediction(motion_prediction, logits)
+
+    def parameter_groups(self) -> list[dict]:
+        """Parameters with weight decay (matrices of linear layers) and without (the rest), for an optimizer."""
+        decay, no_decay = [], []
+        for name, parameter in self.named_parameters():
+            is_matrix = parameter.ndim == 2 and "positions" not in name
+            (decay if is_matrix else no_decay).append(parameter)
+        return [{"params": decay}, {"params": no_decay, "weight_decay": 0.0}]
+
+
+def _initialise(module: nn.Module) -> None:
+    """GPT-2's initialisation, which Diffusion Policy's transformer uses."""
+    if isinstance(module, nn.Linear):
+        nn.init.normal_(module.weight, std=0.02)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+    elif isinstance(module, nn.MultiheadAttention):
+        nn.init.normal_(module.in_proj_weight, std=0.02)
+        nn.init.zeros_(module.in_proj_bias)

@@ -1,0 +1,249 @@
+"""The planner as a LeRobot policy."""
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION
+from safetensors import SafetensorError
+from torch import Generator, Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+
+from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
+from .denoiser import Denoiser, Prediction
+from .encoders import StateEncoder
+from .plan import Plan, PlanPrompt
+from .processes import GaussianProcess, MaskedProcess
+from .sampling import DenoisingState, sample_plan
+from .vocabulary import Vocabulary
+
+
+class Planner(nn.Module):
+    """The network that is trained: the observation's encoder and the denoiser."""
+
+    def __init__(self, config: HDPConfig):
+        super().__init__()
+        self.encoder = StateEncoder(config.input_features, config.width)
+        self.denoiser = Denoiser(
+            action_dim=config.action_feature.shape[0],
+            horizon=config.horizon,
+            observation_tokens=self.encoder.num_tokens,
+            num_train_timesteps=config.num_train_timesteps,
+            vocabulary_size=len(config.vocabulary) if config.plan_symbols else 0,
+            symbolic_horizon=config.symbolic_horizon if config.plan_symbols else 0,
+            num_layers=config.num_layers,
+            num_heads=config.num_heads,
+            width=config.width,
+            dropout=config.dropout,
+        )
+
+
+class HDPPolicy(PreTrainedPolicy):
+    """Hybrid Diffusion Planner (Høeg et al. 2026): denoises a motion and the symbolic plan behind it at once.
+
+    An open-loop planner: one observation, the whole plan, executed to its end.
+
+    Args:
+        config: the planner's configuration, complete with what the dataset says.
+        dataset_meta: metadata of the dataset that the policy is to be trained on; its episodes are checked against
+            the horizon.
+    """
+
+    config_class = HDPConfig
+    name = "hdp"
+
+    def __init__(self, config: HDPConfig, dataset_stats: Any = None, dataset_meta: Any = None):
+        super().__init__(config)
+        config.validate_features()
+        if dataset_meta is not None:
+            _check_episodes_fit(config, dataset_meta.episodes["length"])
+        self.vocabulary = Vocabulary(config.vocabulary) if config.plan_symbols else None
+        self.motion_process = GaussianProcess(
+            config.num_train_timesteps, config.prediction_type, eta={"ddpm": 1.0, "ddim": 0.0}[config.sampler]
+        )
+        self.symbol_process = MaskedProcess(len(self.vocabulary)) if self.vocabulary else None
+
+        self.planner = Planner(config)
+        self.ema = _moving_average(self.planner, config) if config.ema_max_decay > 0 else None
+        if config.compile_model:
+            for network in {self.planner, self._planning_network}:
+                network.denoiser.compile(mode=config.compile_mode)
+        # Training noise is a function of these two, so that a resumed run goes on exactly as if never interrupted.
+        self.register_buffer("noise_seed", torch.randint(2**31, ()))
+        self.register_buffer("forward_calls", torch.tensor(0))
+        self.reset()
+
+    def get_optim_params(self) -> list[dict]:
+        encoder = {"params": list(self.planner.encoder.parameters())}
+        return [encoder, *self.planner.denoiser.parameter_groups()]
+
+    def reset(self) -> None:
+        """Forget the plan in execution. To be called on `env.reset()`."""
+        self._queue: deque[Tensor] = deque()
+
+    def update(self) -> None:
+        """Move the averaged weights. LeRobot calls this after each optimiser step."""
+        if self.ema is not None:
+            self.ema.update_parameters(self.planner)
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Algorithm 1: corrupt motion and symbols independently, denoise both, L = L_DDPM + lambda L_MD4.
+
+        Args:
+            batch: preprocessed observations, `action` (B, H_c, D) and `observation.symbolic_plan` (B, H_d).
+
+        Returns:
+            The loss, and its two parts for logging.
+        """
+        if not self.training:
+            return self._loss(batch, self._planning_network)
+        self.forward_calls += 1
+        with torch.random.fork_rng(devices=self._cuda_devices):
+            torch.manual_seed(_step_seed(int(self.noise_seed), int(self.forward_calls)))
+            return self._loss(batch, self.planner)
+
+    def _loss(self, batch: dict[str, Tensor], network: Planner) -> tuple[Tensor, dict[str, float]]:
+        motion = batch[ACTION]
+        batch_size, device = len(motion), motion.device
+        k_c = self.motion_process.sample_level(batch_size, device)
+        noisy_motion = self.motion_process.corrupt(motion, k_c)
+        observation = network.encoder(batch)
+        if self.symbol_process is None:
+            prediction = network.denoiser(noisy_motion.value, None, observation, k_c, torch.zeros_like(k_c))
+            loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
+            return loss, {"motion_loss": loss.item()}
+
+        k_d = self.symbol_process.sample_level(batch_size, device)
+        masked_symbols = self.symbol_process.corrupt(batch[OBS_SYMBOLIC_PLAN], k_d)
+        prediction = network.denoiser(noisy_motion.value, masked_symbols.value, observation, k_c, k_d)
+        motion_loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
+        symbol_loss = self.symbol_process.loss(prediction.logits, masked_symbols).mean()
+        loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
+        return loss, {"motion_loss": motion_loss.item(), "symbol_loss": symbol_loss.item()}
+
+    @torch.no_grad()
+    def plan(
+        self,
+        batch: dict[str, Tensor],
+        prompt: PlanPrompt | None = None,
+        generator: Generator | None = None,
+        on_step: Callable[[int, DenoisingState], None] | None = None,
+    ) -> Plan:
+        """Algorithm 2: make a plan for each observation of a batch, from scratch or around a prompt.
+
+        Args:
+            batch: preprocessed observations. `observation.symbolic_plan` among them, as an environment may give it,
+                is a prompt.
+            prompt: the part of the plan that is given.
+            generator: source of all randomness; None: PyTorch's global one.
+            on_step: sees the half-done plan after each step.
+
+        Raises:
+            ValueError: an observation with NaN or infinity, or a prompt that does not fit.
+        """
+        for key in self.config.input_features:
+            if not torch.isfinite(batch[key]).all():
+                raise ValueError(f"{key} holds NaN or infinity: no plan can be made from it")
+        if prompt is None and OBS_SYMBOLIC_PLAN in batch and self.symbol_process is not None:
+            prompt = PlanPrompt(token_ids=batch[OBS_SYMBOLIC_PLAN])
+        batch_size, device = len(batch[self.planner.encoder.keys[0]]), self.noise_seed.device
+        motion_shape = (batch_size, self.config.horizon, self.config.action_feature.shape[0])
+        self._check_prompt(prompt, motion_shape)
+
+        network = self._planning_network
+        observation = network.encoder(batch)
+
+        def denoise(motion: Tensor, tokens: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
+            with torch.autocast(device.type, torch.bfloat16, enabled=self.config.dtype == "bfloat16"):
+                prediction = network.denoiser(motion, tokens, observation, k_c, k_d)
+            return Prediction(prediction.motion.float(), prediction.logits)
+
+        motion, tokens, probabilities = sample_plan(
+            denoise,
+            self.motion_process,
+            self.symbol_process,
+            motion_shape,
+            self.config.symbolic_horizon or 0,
+            device,
+            self.config.num_inference_steps or self.config.num_train_timesteps,
+            prompt,
+            generator,
+            on_step,
+        )
+        return Plan(motion, tokens, probabilities, self.vocabulary)
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
+        """The plan's actions that are executed before the next plan: (B, n_action_steps, D)."""
+        return self.plan(batch).actions[:, : self.config.n_action_steps]
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
+        """The next action of the plan, after making one if there is none: (B, D)."""
+        if not self._queue:
+            self._queue.extend(self.predict_action_chunk(batch).unbind(dim=1))
+        return self._queue.popleft()
+
+    @property
+    def _planning_network(self) -> Planner:
+        """The averaged weights, where there are any."""
+        return self.planner if self.ema is None else self.ema.module
+
+    @property
+    def _cuda_devices(self) -> list[torch.device]:
+        device = self.noise_seed.device
+        return [device] if device.type == "cuda" else []
+
+    def _check_prompt(self, prompt: PlanPrompt | None, motion_shape: tuple[int, int, int]) -> None:
+        if prompt is None:
+            return
+        if prompt.token_ids is not None:
+            if self.symbol_process is None:
+                raise ValueError("this planner models no symbols (plan_symbols=false): it takes no symbolic prompt")
+            expected = (motion_shape[0], self.config.symbolic_horizon)
+            if tuple(prompt.token_ids.shape) != expected:
+                raise ValueError(f"token_ids must have the shape {expected}, got {tuple(prompt.token_ids.shape)}")
+        if prompt.actions is not None and tuple(prompt.actions.shape) != motion_shape:
+            raise ValueError(f"actions must have the shape {motion_shape}, got {tuple(prompt.actions.shape)}")
+
+    @classmethod
+    def _load_as_safetensor(cls, model: "HDPPolicy", model_file: str, map_location: str, strict: bool) -> "HDPPolicy":
+        """Load the whole checkpoint or none of it: half-loaded weights plan nonsense without a word."""
+        try:
+            return super()._load_as_safetensor(model, model_file, map_location, strict=True)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{model_file} is missing from the checkpoint") from error
+        except SafetensorError as error:
+            raise ValueError(f"{model_file} is damaged or incomplete ({error}); copy the checkpoint again") from error
+
+
+def _moving_average(network: nn.Module, config: HDPConfig) -> AveragedModel:
+    """Exponential moving average with Diffusion Policy's warm-up of the decay."""
+
+    @torch.no_grad()
+    def update(averaged: list[Tensor], current: list[Tensor], num_averaged: Tensor) -> None:
+        decay = min(1 - (1 + int(num_averaged)) ** -config.ema_power, config.ema_max_decay)
+        torch._foreach_lerp_(averaged, current, 1 - decay)
+
+    average = AveragedModel(network, multi_avg_fn=update)
+    return average.requires_grad_(False).eval()
+
+
+def _step_seed(noise_seed: int, call: int) -> int:
+    """A seed for one training step, different on each process of a distributed run."""
+    rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
+    return int(np.random.SeedSequence([noise_seed, call, rank]).generate_state(1)[0])
+
+
+def _check_episodes_fit(config: HDPConfig, lengths: Iterable[int]) -> None:
+    """Whole plans need episodes of exactly the horizon's length."""
+    lengths = set(lengths)
+    if config.plan_from == "episode_start" and lengths != {config.horizon}:
+        raise ValueError(
+            f"the dataset's episodes have {min(lengths)} to {max(lengths)} frames, the planner's horizon is "
+            f"{config.horizon}. Set --policy.horizon to the episodes' length; if they differ among each other, "
+            "train with --policy.plan_from=any_frame."
+        )

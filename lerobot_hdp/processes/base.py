@@ -1,0 +1,60 @@
+"""The interface that the two diffusion processes share.
+
+A level is a number in [0, 1] for each sample: 0 is clean, 1 is fully corrupted (the paper's k_c and k_d).
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Generator, Tensor
+
+
+@dataclass(frozen=True)
+class Corrupted:
+    """A training example of a process.
+
+    Attributes:
+        value: (B, H, ...) what the denoiser sees.
+        target: (B, H, ...) what the denoiser should predict.
+        level: (B,) how strongly the value is corrupted.
+    """
+
+    value: Tensor
+    target: Tensor
+    level: Tensor
+
+
+class Process(Protocol):
+    """Corrupts clean data step by step, and knows how to go back."""
+
+    def sample_level(self, batch_size: int, device: torch.device) -> Tensor:
+        """Levels to train on: (B,)."""
+        ...
+
+    def corrupt(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Corrupted:
+        """Draw from q(value at a level | clean)."""
+        ...
+
+    def loss(self, prediction: Tensor, corrupted: Corrupted) -> Tensor:
+        """The training loss of each sample: (B,)."""
+        ...
+
+    def prior(self, shape: tuple[int, ...], device: torch.device, generator: Generator | None = None) -> Tensor:
+        """Fully corrupted data, where the way back starts."""
+        ...
+
+    def levels(self, num_steps: int) -> Tensor:
+        """The levels of a way back in `num_steps` steps, from 1 down to 0: (num_steps + 1,)."""
+        ...
+
+    def reverse_step(
+        self, value: Tensor, prediction: Tensor, level: Tensor, next_level: Tensor, generator: Generator | None = None
+    ) -> Tensor:
+        """Draw from p(value at the next, lower level | value, prediction). The two levels are scalars."""
+        ...
+
+
+def expand_to(level: Tensor, value: Tensor) -> Tensor:
+    """Give a level of shape (B,) or () trailing axes, so that it broadcasts against a (B, ...) value."""
+    return level.reshape(level.shape + (1,) * (value.ndim - level.ndim)) if level.ndim else level

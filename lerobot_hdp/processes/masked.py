@@ -1,0 +1,73 @@
+"""The masked process over the symbols (paper, Eq. 4-6): MD4, Shi et al. 2024.
+
+Each token is masked independently with probability k, so that alpha(k) = 1 - k:
+
+    Eq. 4   q(A^k | A^0): a token is e_m with probability k, else what it was
+    Eq. 5   L = sum over masked positions of w(k) cross_entropy, with w(k) = -alpha'(k) / (1 - alpha(k)) = 1 / k
+    Eq. 6   p(A^s | A^k): a masked token is revealed with probability gamma = (alpha(s) - alpha(k)) / (1 - alpha(k))
+            = (k - s) / k, its value drawn from the predicted categorical; what is revealed stays
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Generator, Tensor
+
+from .base import Corrupted, expand_to
+
+MIN_LEVEL = 1e-3
+"""Training keeps k off 0, where the weight 1 / k has no bound."""
+
+
+class MaskedProcess:
+    """MD4 over (B, H) token ids.
+
+    Args:
+        vocabulary_size: m, the number of symbols; the mask e_m has the id m.
+    """
+
+    def __init__(self, vocabulary_size: int):
+        self.vocabulary_size = vocabulary_size
+        self.mask_id = vocabulary_size
+
+    def sample_level(self, batch_size: int, device: torch.device) -> Tensor:
+        """Low-discrepancy sampling (Kingma et al. 2021): one level in each of B equal parts of (0, 1]."""
+        offsets = torch.randperm(batch_size, device=device)
+        uniform = (torch.rand(1, device=device) + offsets) / batch_size
+        return MIN_LEVEL + (1 - MIN_LEVEL) * uniform
+
+    def corrupt(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Corrupted:
+        uniform = torch.rand(clean.shape, device=clean.device, generator=generator)
+        masked = uniform < expand_to(level, clean)
+        return Corrupted(value=clean.masked_fill(masked, self.mask_id), target=clean, level=level)
+
+    def loss(self, prediction: Tensor, corrupted: Corrupted) -> Tensor:
+        """Weighted cross-entropy of each sample, summed over its masked positions (Eq. 5): (B,).
+
+        Args:
+            prediction: (B, H, m) logits.
+        """
+        cross_entropy = F.cross_entropy(prediction.float().transpose(1, 2), corrupted.target, reduction="none")
+        masked = corrupted.value == self.mask_id
+        return (cross_entropy * masked).sum(dim=1) / corrupted.level
+
+    def prior(self, shape: tuple[int, ...], device: torch.device, generator: Generator | None = None) -> Tensor:
+        return torch.full(shape, self.mask_id, dtype=torch.int64, device=device)
+
+    def levels(self, num_steps: int) -> Tensor:
+        """cos(pi i / 2N): few tokens are revealed at first, many at the end (Chang et al. 2022)."""
+        levels = torch.cos(torch.arange(num_steps + 1) * (math.pi / (2 * num_steps)))
+        levels[-1] = 0.0
+        return levels
+
+    def reverse_step(
+        self, value: Tensor, prediction: Tensor, level: Tensor, next_level: Tensor, generator: Generator | None = None
+    ) -> Tensor:
+        """Eq. 6."""
+        reveal_probability = (level - next_level) / level
+        uniform = torch.rand(value.shape, device=value.device, generator=generator)
+        revealed = (value == self.mask_id) & (uniform < reveal_probability)
+        probabilities = prediction.float().softmax(dim=-1).flatten(0, -2)
+        drawn = torch.multinomial(probabilities, 1, generator=generator).reshape(value.shape)
+        return torch.where(revealed, drawn, value)

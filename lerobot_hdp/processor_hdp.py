@@ -1,0 +1,81 @@
+"""Dataset or environment batch <-> what the planner sees."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import (
+    ObservationProcessorStep,
+    PolicyAction,
+    PolicyProcessorPipeline,
+    ProcessorStepRegistry,
+)
+from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
+from torch import Tensor
+
+from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
+from .vocabulary import FREE
+
+
+@ProcessorStepRegistry.register(name="hdp_symbolic_plan")
+@dataclass
+class SymbolicPlanProcessorStep(ObservationProcessorStep):
+    """Make `observation.symbolic_plan` what the planner expects: (B, symbolic_horizon) int64 token ids.
+
+    Plans from a dataset are filled with PAD up to the planner's horizon; prompts from an environment may hold FREE
+    (-1). A planner without symbols never sees the column.
+
+    Attributes:
+        symbolic_horizon: H_d; None: the planner models no symbols.
+        vocabulary_size: m.
+    """
+
+    symbolic_horizon: int | None = None
+    vocabulary_size: int = 0
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        plan = observation.pop(OBS_SYMBOLIC_PLAN, None)
+        if plan is None or self.symbolic_horizon is None:
+            return observation
+        plan = torch.as_tensor(plan).long()
+        if plan.ndim == 1:
+            plan = plan.unsqueeze(0)
+        if plan.shape[1] > self.symbolic_horizon:
+            raise ValueError(f"a plan of {plan.shape[1]} tokens is longer than {self.symbolic_horizon=}")
+        unknown = (plan < FREE) | (plan >= self.vocabulary_size)
+        if unknown.any():
+            raise ValueError(
+                f"{OBS_SYMBOLIC_PLAN} holds the token id {plan[unknown][0].item()}, which is none of the "
+                f"{self.vocabulary_size} symbols"
+            )
+        observation[OBS_SYMBOLIC_PLAN] = F.pad(plan, (0, self.symbolic_horizon - plan.shape[1]))
+        return observation
+
+    def get_config(self) -> dict[str, Any]:
+        return {"symbolic_horizon": self.symbolic_horizon, "vocabulary_size": self.vocabulary_size}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
+def make_hdp_pre_post_processors(
+    config: HDPConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
+) -> tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
+]:
+    """LeRobot's default processors, and the symbolic plan as token ids."""
+    steps = make_default_policy_processor_steps(config, dataset_stats)
+    symbolic_plan = SymbolicPlanProcessorStep(
+        symbolic_horizon=config.symbolic_horizon if config.plan_symbols else None,
+        vocabulary_size=len(config.vocabulary or []),
+    )
+    return make_policy_processor_pipelines(
+        input_steps=[
+            steps.rename_observations, steps.add_batch_dim, symbolic_plan, steps.to_device, steps.normalize
+        ],
+        output_steps=[steps.unnormalize, steps.to_cpu],
+    )  # fmt: skip

@@ -1,0 +1,95 @@
+"""The symbols of a plan and their token ids."""
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+FREE = -1
+"""Token id, in a prompt, of a position that the planner decides."""
+FREE_WORD = "_"
+"""The same in words."""
+
+
+class Vocabulary:
+    """Symbols in words <-> token ids.
+
+    The id of a symbol is its position; symbol 0 fills the end of a plan that is shorter than the symbolic horizon.
+    The mask of the masked process has the id `mask_id = len(vocabulary)`. It is no symbol: it is neither read nor
+    printed, and no plan holds it.
+
+    Example:
+        >>> vocabulary = Vocabulary(["PAD", "A", "B", "PICK"])
+        >>> vocabulary.encode("PICK B", length=4)
+        tensor([3, 2, 0, 0])
+        >>> vocabulary.decode([3, 2, 0, 0])
+        ['PICK', 'B']
+    """
+
+    def __init__(self, symbols: Sequence[str]):
+        if len(symbols) < 2 or len({symbol.upper() for symbol in symbols}) != len(symbols):
+            raise ValueError(f"a vocabulary is PAD and at least one more symbol, each once; got {list(symbols)}")
+        self.symbols = tuple(symbols)
+        self._ids = {symbol.upper(): i for i, symbol in enumerate(self.symbols)}
+
+    def __len__(self) -> int:
+        return len(self.symbols)
+
+    @property
+    def pad_id(self) -> int:
+        return 0
+
+    @property
+    def mask_id(self) -> int:
+        return len(self.symbols)
+
+    def encode(self, plan: str | Sequence[str], length: int) -> Tensor:
+        """A whole plan as token ids, filled with PAD: (length,) int64.
+
+        Args:
+            plan: symbols, or one string of symbols with spaces between them; case does not matter.
+
+        Raises:
+            ValueError: an unknown symbol, or more symbols than `length`.
+        """
+        return self._to_ids(plan, length, fill=self.pad_id, allow_free=False)
+
+    def encode_prompt(self, prompt: str | Sequence[str], length: int) -> Tensor:
+        """The beginning of a plan as token ids, FREE where the planner decides: (length,) int64.
+
+        Args:
+            prompt: like a plan, and `_` for a position that is left open; so is what comes after the last word.
+
+        Raises:
+            ValueError: an unknown symbol, or more words than `length`.
+        """
+        return self._to_ids(prompt, length, fill=FREE, allow_free=True)
+
+    def decode(self, ids: Iterable[int] | Tensor) -> list[str]:
+        """The symbols of a plan, without the PAD at its end.
+
+        Raises:
+            ValueError: an id that is no symbol's.
+        """
+        ids = [int(i) for i in ids]
+        while ids and ids[-1] == self.pad_id:
+            ids.pop()
+        for position, i in enumerate(ids):
+            if not 0 <= i < len(self):
+                raise ValueError(f"token id {i} at position {position} is none of the {len(self)} symbols")
+        return [self.symbols[i] for i in ids]
+
+    def _to_ids(self, words: str | Sequence[str], length: int, fill: int, allow_free: bool) -> Tensor:
+        words = words.split() if isinstance(words, str) else list(words)
+        if len(words) > length:
+            raise ValueError(f"{len(words)} symbols do not fit into a plan of {length}")
+        ids = torch.full((length,), fill, dtype=torch.int64)
+        for position, word in enumerate(words):
+            if allow_free and word == FREE_WORD:
+                continue
+            if word.upper() not in self._ids:
+                raise ValueError(
+                    f"unknown symbol {word!r} at position {position + 1}; the symbols are {' '.join(self.symbols)}"
+                )
+            ids[position] = self._ids[word.upper()]
+        return ids
