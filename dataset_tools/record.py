@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import datasets
 import gymnasium as gym
 import numpy as np
+from draccus.utils import ParsingError
 from lerobot.configs import parser
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.io_utils import load_info, write_info
@@ -348,6 +349,8 @@ def main() -> None:
         _main()
     except KeyboardInterrupt:
         sys.exit("hdp-record: interrupted; go on with --resume=true")
+    except ParsingError as error:  # draccus wraps what a configuration object objects to
+        sys.exit(f"hdp-record: {error.__cause__ or error}")
     except (ValueError, FileExistsError) as error:
         sys.exit(f"hdp-record: {error}")
 

@@ -110,9 +110,9 @@ class BlockSorting2DEnv(gym.Env):
 
         reach = np.array([self.slots[-1, 0] + 0.1, 0.2])
         self.workspace = np.stack([-reach, reach])
-        self.action_space = gym.spaces.Box(
-            np.array([*-reach, 0.0], np.float32), np.array([*reach, 1.0], np.float32), dtype=np.float32
-        )
+        self.action_low = np.array([*-reach, 0.0], np.float32)
+        self.action_high = np.array([*reach, 1.0], np.float32)
+        self.action_space = gym.spaces.Box(self.action_low, self.action_high, dtype=np.float32)
         self.observation_space = gym.spaces.Dict(
             agent_pos=self.action_space,
             environment_state=gym.spaces.Box(
@@ -133,7 +133,7 @@ class BlockSorting2DEnv(gym.Env):
             options: `{"order": [...]}` fixes the order: `order[slot]` is the block that starts in that slot.
         """
         super().reset(seed=seed)
-        order = np.arange(self.n_blocks)
+        order: np.ndarray = np.arange(self.n_blocks)
         while np.array_equal(order, np.arange(self.n_blocks)):
             order = self.np_random.permutation(self.n_blocks)
         if options and "order" in options:
@@ -159,7 +159,7 @@ class BlockSorting2DEnv(gym.Env):
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (3,) or not np.isfinite(action).all():
             raise ValueError(f"an action is 3 finite numbers (x, y, gripper), got {action.tolist()}")
-        low, high = self.action_space.low, self.action_space.high
+        low, high = self.action_low, self.action_high
         clipped = bool(((action < low - 1e-6) | (action > high + 1e-6)).any())
         action = np.clip(action, low, high)
 
@@ -224,7 +224,7 @@ class BlockSorting2DEnv(gym.Env):
         return {"is_success": ended and score == 1.0, "score": score, "action_clipped": clipped}
 
 
-PIXELS_PER_METRE = 600
+PIXELS_PER_METRE = 800
 BACKGROUND, INK, GRIPPER_COLOUR = (250, 249, 246), (60, 60, 60), (40, 40, 40)
 
 

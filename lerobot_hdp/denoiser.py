@@ -27,9 +27,9 @@ class SinusoidalEmbedding(nn.Module):
     def __init__(self, width: int):
         super().__init__()
         half = width // 2
-        self.register_buffer(
-            "frequencies", torch.exp(-math.log(10_000) * torch.arange(half) / (half - 1)), persistent=False
-        )
+        frequencies = torch.exp(-math.log(10_000) * torch.arange(half) / (half - 1))
+        self.frequencies: Tensor
+        self.register_buffer("frequencies", frequencies, persistent=False)
 
     def forward(self, step: Tensor) -> Tensor:
         angles = step[:, None] * self.frequencies
@@ -99,7 +99,7 @@ class Denoiser(nn.Module):
 
         Args:
             motion: (B, H_c, D) noisy motion A_c.
-            tokens: (B, H_d) partly masked token ids A_d; ignored where no symbols are modelled.
+            tokens: (B, H_d) partly masked token ids A_d; None where no symbols are modelled.
             observation: (B, n, width) encoded observation O.
             motion_level: (B,) k_c in [0, 1].
             symbol_level: (B,) k_d in [0, 1].
@@ -107,7 +107,7 @@ class Denoiser(nn.Module):
         # A clean motion (k_c = 0) is shown at the lowest level of training, whose noise is next to none.
         step = (motion_level * self.num_train_timesteps - 1).clamp(min=0)
         plan, levels = [self.embed_motion(motion)], [self.embed_motion_level(step)]
-        if self.models_symbols:
+        if tokens is not None:
             one_hot = F.one_hot(tokens, self.vocabulary_size + 1).to(self.embed_symbols.weight.dtype)
             plan.append(self.embed_symbols(one_hot))
             levels.append(self.embed_symbol_level(symbol_level[:, None]))
@@ -122,7 +122,8 @@ class Denoiser(nn.Module):
 
     def parameter_groups(self) -> list[dict]:
         """Parameters with weight decay (matrices of linear layers) and without (the rest), for an optimizer."""
-        decay, no_decay = [], []
+        decay: list[nn.Parameter] = []
+        no_decay: list[nn.Parameter] = []
         for name, parameter in self.named_parameters():
             is_matrix = parameter.ndim == 2 and "positions" not in name
             (decay if is_matrix else no_decay).append(parameter)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from .vocabulary import FREE, Vocabulary
@@ -26,9 +27,18 @@ class PlanPrompt:
             raise ValueError("actions_given says which actions are given, but there are no actions")
 
     @property
-    def tokens_given(self) -> Tensor | None:
-        """(B, H_d) bool, which tokens are given."""
+    def tokens_mask(self) -> Tensor | None:
+        """(B, H_d) bool, which tokens are given; None: none of them."""
         return None if self.token_ids is None else self.token_ids != FREE
+
+    @property
+    def actions_mask(self) -> Tensor | None:
+        """(B, H_c, 1) bool, which actions are given; None: none of them."""
+        if self.actions is None:
+            return None
+        if self.actions_given is None:
+            return torch.ones_like(self.actions[..., :1], dtype=torch.bool)
+        return self.actions_given[..., None]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The way back: from noise and masks to a plan (paper, Algorithm 2), free or with a part of the plan given."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -8,7 +9,7 @@ from torch import Generator, Tensor
 
 from .denoiser import Prediction
 from .plan import PlanPrompt
-from .processes import GaussianProcess, MaskedProcess
+from .processes import GaussianProcess, MaskedProcess, Process
 
 Denoise = Callable[[Tensor, Tensor | None, Tensor, Tensor], Prediction]
 """(motion (B, H_c, D), tokens (B, H_d), k_c (B,), k_d (B,)) -> Prediction, for a fixed observation."""
@@ -20,12 +21,54 @@ class DenoisingState(NamedTuple):
     Attributes:
         motion: (B, H_c, D) partly denoised motion.
         tokens: (B, H_d) partly unmasked token ids, None where no symbols are modelled.
-        token_probabilities: (B, H_d) the probability with which each token was drawn; 1 where given, 0 where masked.
+        token_probabilities: (B, H_d) the probability with which each token was drawn; 1 where given, 0 where masked;
+            (B, 0) where no symbols are modelled.
     """
 
     motion: Tensor
     tokens: Tensor | None
-    token_probabilities: Tensor | None
+    token_probabilities: Tensor
+
+
+@dataclass
+class Stream:
+    """One of the two processes on its way back, around what is given of it.
+
+    Attributes:
+        process: the process.
+        value: (B, H, ...) where it is.
+        levels: (num_steps + 1,) the levels it passes; all 0 where everything is given (k = 0).
+        clean: like `value`, the given part; None: nothing is given.
+        given: broadcastable against `value`, bool, which of `clean` is given.
+    """
+
+    process: Process
+    value: Tensor
+    levels: Tensor
+    clean: Tensor | None = None
+    given: Tensor | None = None
+
+    def __post_init__(self):
+        self.all_given = self.given is not None and bool(self.given.all())
+        if self.all_given:
+            self.levels = torch.zeros_like(self.levels)
+
+    def level(self, step: int) -> Tensor:
+        """The level before a step, for each sample: (B,)."""
+        return self.levels[step].expand(len(self.value))
+
+    def set_given(self, step: int, generator: Generator | None) -> None:
+        """Put the given part into the value as it looks before a step."""
+        if self.clean is not None and self.given is not None:
+            shown = self.process.show_given(self.clean, self.level(step), generator)
+            self.value = torch.where(self.given, shown, self.value)
+
+    def advance(self, step: int, prediction: Tensor, generator: Generator | None) -> None:
+        """Take a reverse step."""
+        if not self.all_given:
+            levels = self.levels[step], self.levels[step + 1]
+            self.value = self.process.reverse_step(self.value, prediction, *levels, generator)
+        self.set_given(step + 1, generator)
 
 
 @torch.no_grad()
@@ -44,7 +87,7 @@ def sample_plan(
     """Algorithm 2: denoise the motion and unmask the symbols in the same steps, each seeing the other.
 
     What the prompt gives stays fixed at every step. Given symbols are seen clean; a given action is seen with the
-    noise of the current level, as in training, and clean (k_c = 0) where the whole motion is given.
+    noise of the current level, as in training. Where all symbols or the whole motion are given, k_d or k_c is 0.
 
     Args:
         denoise: the denoiser, with its observation.
@@ -55,70 +98,47 @@ def sample_plan(
         num_steps: number of calls of the denoiser.
         prompt: the part of the plan that is given.
         generator: source of all randomness; None: PyTorch's global one.
-        on_step: called after each step with its index and the state, and once before the first with index 0.
+        on_step: called after each step with its number and the state, and before the first with 0.
     """
-    batch_size = motion_shape[0]
     prompt = prompt or PlanPrompt()
-    motion_levels = motion_process.levels(num_steps).to(device)
-    motion = motion_process.prior(motion_shape, device, generator)
-    actions_given = _actions_given(prompt)
-    whole_motion_given = actions_given is not None and bool(actions_given.all())
-    if whole_motion_given:
-        motion_levels = torch.zeros_like(motion_levels)
 
-    tokens = probabilities = None
-    all_tokens_given = False
-    symbol_levels = torch.zeros(num_steps + 1, device=device)
+    def start(process: Process, shape: tuple[int, ...], clean: Tensor | None, given: Tensor | None) -> Stream:
+        prior = process.prior(shape, device, generator)
+        stream = Stream(process, prior, process.levels(num_steps).to(device), clean, given)
+        stream.set_given(0, generator)
+        return stream
+
+    batch_size = motion_shape[0]
+    motion = start(motion_process, motion_shape, prompt.actions, prompt.actions_mask)
+    symbols: Stream | None = None
+    tokens: Tensor | None = None
+    probabilities = torch.zeros(batch_size, 0, device=device)
+    k_d = torch.zeros(batch_size, device=device)
     if symbol_process is not None:
-        tokens = symbol_process.prior((batch_size, symbolic_horizon), device, generator)
-        probabilities = torch.zeros(tokens.shape, device=device)
-        symbol_levels = symbol_process.levels(num_steps).to(device)
-        if prompt.token_ids is not None:
-            tokens = torch.where(prompt.tokens_given, prompt.token_ids, tokens)
-            probabilities = prompt.tokens_given.to(probabilities.dtype)
-            all_tokens_given = bool(prompt.tokens_given.all())
-            if all_tokens_given:
-                symbol_levels = torch.zeros_like(symbol_levels)
+        symbols = start(symbol_process, (batch_size, symbolic_horizon), prompt.token_ids, prompt.tokens_mask)
+        tokens = symbols.value
+        probabilities = (tokens != symbol_process.mask_id).float()
 
-    motion = _give_actions(motion, motion_process, motion_levels[0], prompt, actions_given, generator)
     if on_step is not None:
-        on_step(0, DenoisingState(motion, tokens, probabilities))
+        on_step(0, DenoisingState(motion.value, tokens, probabilities))
     for i in range(num_steps):
-        k_c, k_d = motion_levels[i], symbol_levels[i]
-        prediction = denoise(motion, tokens, k_c.expand(batch_size), k_d.expand(batch_size))
-        if not whole_motion_given:
-            next_k_c = motion_levels[i + 1]
-            motion = motion_process.reverse_step(motion, prediction.motion, k_c, next_k_c, generator)
-            motion = _give_actions(motion, motion_process, next_k_c, prompt, actions_given, generator)
-        if symbol_process is not None and not all_tokens_given:
-            before, logits = tokens, prediction.logits
-            tokens = symbol_process.reverse_step(before, logits, k_d, symbol_levels[i + 1], generator)
-            drawn = logits.float().softmax(dim=-1).gather(-1, tokens.clamp(max=logits.shape[-1] - 1)[..., None])
-            probabilities = torch.where(tokens != before, drawn.squeeze(-1), probabilities)
+        if symbols is not None:
+            k_d = symbols.level(i)
+        prediction = denoise(motion.value, tokens, motion.level(i), k_d)
+        motion.advance(i, prediction.motion, generator)
+        if symbols is not None:
+            assert prediction.logits is not None
+            before = symbols.value
+            symbols.advance(i, prediction.logits, generator)
+            drawn = _token_probabilities(prediction.logits, symbols.value)
+            probabilities = torch.where(symbols.value == before, probabilities, drawn)
+            tokens = symbols.value
         if on_step is not None:
-            on_step(i + 1, DenoisingState(motion, tokens, probabilities))
-    return DenoisingState(motion, tokens, probabilities)
+            on_step(i + 1, DenoisingState(motion.value, tokens, probabilities))
+    return DenoisingState(motion.value, tokens, probabilities)
 
 
-def _actions_given(prompt: PlanPrompt) -> Tensor | None:
-    """(B, H_c) bool, or None where no action is given."""
-    if prompt.actions is None:
-        return None
-    if prompt.actions_given is None:
-        return torch.ones(prompt.actions.shape[:2], dtype=torch.bool, device=prompt.actions.device)
-    return prompt.actions_given
-
-
-def _give_actions(
-    motion: Tensor,
-    process: GaussianProcess,
-    level: Tensor,
-    prompt: PlanPrompt,
-    given: Tensor | None,
-    generator: Generator | None,
-) -> Tensor:
-    """Put the prompt's actions, at the noise of the level, into a motion."""
-    if given is None:
-        return motion
-    noisy = process.corrupt(prompt.actions, level.expand(len(motion)), generator).value
-    return torch.where(given[..., None], noisy, motion)
+def _token_probabilities(logits: Tensor, tokens: Tensor) -> Tensor:
+    """The probability that logits (B, H, m) give to tokens (B, H); arbitrary for masked ones: (B, H)."""
+    symbols = tokens.clamp(max=logits.shape[-1] - 1)
+    return logits.float().softmax(dim=-1).gather(-1, symbols[..., None]).squeeze(-1)

@@ -67,7 +67,8 @@ def test_the_expert_always_succeeds_within_the_horizon(n_blocks, waypoints_per_p
         demonstration = EXPERTS[TASK_ID](env, np.random.default_rng(seed))
         for action in demonstration.waypoints[:-1]:
             _, reward, terminated, truncated, info = env.step(action)
-            assert not (terminated or truncated or reward or info["is_success"] or info["action_clipped"])
+            assert (terminated, truncated, reward, info["is_success"]) == (False, False, 0.0, False)
+            assert not info["action_clipped"]
         _, reward, _, truncated, info = env.step(demonstration.waypoints[-1])
         assert truncated
         assert info["is_success"]

@@ -1,6 +1,7 @@
 """The two diffusion processes against the paper's equations."""
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -138,7 +139,7 @@ class TestMaskedProcess:
         process = MaskedProcess(vocabulary_size=4)
         levels = process.levels(num_steps)
         value = process.prior((64, 30), torch.device("cpu"))
-        for level, next_level in zip(levels, levels[1:], strict=False):
+        for level, next_level in pairwise(levels):
             value = process.reverse_step(value, torch.randn(64, 30, 4), level, next_level)
         assert value.max() < process.mask_id
 

@@ -44,6 +44,10 @@ class Process(Protocol):
         """Fully corrupted data, where the way back starts."""
         ...
 
+    def show_given(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Tensor:
+        """How the denoiser sees, at a level, the part of a plan that is given."""
+        ...
+
     def levels(self, num_steps: int) -> Tensor:
         """The levels of a way back in `num_steps` steps, from 1 down to 0: (num_steps + 1,)."""
         ...

@@ -79,6 +79,10 @@ class GaussianProcess:
     def prior(self, shape: tuple[int, ...], device: torch.device, generator: Generator | None = None) -> Tensor:
         return torch.randn(shape, device=device, generator=generator)
 
+    def show_given(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Tensor:
+        """With the noise of the level, as the rest of the motion has it."""
+        return self.corrupt(clean, level, generator).value
+
     def levels(self, num_steps: int) -> Tensor:
         """Evenly spaced training steps."""
         steps = torch.linspace(self.num_train_timesteps, 0, num_steps + 1).round()

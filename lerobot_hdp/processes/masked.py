@@ -55,6 +55,10 @@ class MaskedProcess:
     def prior(self, shape: tuple[int, ...], device: torch.device, generator: Generator | None = None) -> Tensor:
         return torch.full(shape, self.mask_id, dtype=torch.int64, device=device)
 
+    def show_given(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Tensor:
+        """Clean: in training, too, some symbols are clean at every level below 1."""
+        return clean
+
     def levels(self, num_steps: int) -> Tensor:
         """cos(pi i / 2N): few tokens are revealed at first, many at the end (Chang et al. 2022)."""
         levels = torch.cos(torch.arange(num_steps + 1) * (math.pi / (2 * num_steps)))

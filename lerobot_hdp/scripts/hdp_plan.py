@@ -188,6 +188,8 @@ def main() -> None:
     register_third_party_plugins()
     try:
         _main()
+    except ParsingError as error:  # draccus wraps what a configuration object objects to
+        sys.exit(f"hdp-plan: {error.__cause__ or error}")
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"hdp-plan: {error}")
 

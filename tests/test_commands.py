@@ -1,0 +1,188 @@
+"""LeRobot's own commands, and `hdp-plan`, run as a user runs them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from safetensors.torch import load_file
+
+from .conftest import N_EPISODES, REPOSITORY, TASK_FLAGS, TINY_PLANNER, run_command
+
+STEPS, SAVE_FREQ = 12, 5  # with 4 batches an epoch, the first checkpoint lies within the second epoch
+ENV_FLAGS = ("--env.type=hdp", *TASK_FLAGS)
+CONFIGS = sorted((REPOSITORY / "configs").glob("*.json"))
+
+
+def train(dataset_root: Path, output_dir: Path, *flags, policy_flags=None, **kwargs):
+    if policy_flags is None:
+        policy_flags = ["--policy.type=hdp", *(f"--policy.{name}={value}" for name, value in TINY_PLANNER.items())]
+    return run_command(
+        "lerobot-train",
+        "--dataset.repo_id=test/sorting",
+        f"--dataset.root={dataset_root}",
+        "--dataset.video_backend=pyav",
+        f"--output_dir={output_dir}",
+        *policy_flags,
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        "--batch_size=8",
+        f"--steps={STEPS}",
+        f"--save_freq={SAVE_FREQ}",
+        "--num_workers=0",
+        "--log_freq=4",
+        *flags,
+        **kwargs,
+    )
+
+
+@pytest.fixture(scope="module")
+def run_dir(dataset_root, tmp_path_factory) -> Path:
+    """A finished run of `lerobot-train --policy.type=hdp`, with dropout, so that resuming has randomness to restore."""
+    output_dir = tmp_path_factory.mktemp("runs") / "hdp"
+    result = train(dataset_root, output_dir, "--policy.dropout=0.3", *ENV_FLAGS, "--env_eval_freq=0")
+    assert "motion_loss" in result.stderr
+    assert "symbol_loss" in result.stderr
+    return output_dir
+
+
+@pytest.fixture(scope="module")
+def checkpoint(run_dir) -> Path:
+    return run_dir / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_no_page_of_warnings(dataset_root, run_dir, tmp_path):
+    result = train(dataset_root, tmp_path / "run", "--steps=1")
+    noise = [line for line in result.stderr.splitlines() if "WARNING" in line or "Traceback" in line]
+    assert len(noise) <= 3
+
+
+def test_vocabulary_and_normalisation_travel_in_the_checkpoint(checkpoint, dataset_root):
+    config = json.loads((checkpoint / "config.json").read_text())
+    assert config["vocabulary"] == ["PAD", "A", "B", "PICK", "PLACE", "S1", "S2", "AUX"]
+    assert config["symbolic_horizon"] == 18
+    [statistics] = checkpoint.glob("policy_preprocessor*.safetensors")
+    recorded = json.loads((dataset_root / "meta/stats.json").read_text())["action"]["max"]
+    torch.testing.assert_close(load_file(statistics)["action.max"], torch.tensor(recorded))
+
+
+def test_a_resumed_run_ends_with_the_same_weights(dataset_root, run_dir, tmp_path):
+    """What a killed run leaves behind is its last checkpoint: resume from a copy of just that."""
+    stopped = tmp_path / "stopped"
+    first = f"{SAVE_FREQ:06d}"
+    shutil.copytree(run_dir / "checkpoints" / first, stopped / "checkpoints" / first)
+    (stopped / "checkpoints" / "last").symlink_to(first)
+    config = stopped / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    run_command("lerobot-train", f"--config_path={config}", "--resume=true", f"--output_dir={stopped}")
+    whole, resumed = (
+        load_file(run / "checkpoints" / f"{STEPS:06d}" / "pretrained_model" / "model.safetensors")
+        for run in (run_dir, stopped)
+    )
+    assert whole.keys() == resumed.keys()
+    assert all(torch.equal(whole[key], resumed[key]) for key in whole)
+
+
+def test_lerobot_eval_scores_the_policy(checkpoint, tmp_path):
+    run_command(
+        "lerobot-eval",
+        f"--policy.path={checkpoint}",
+        *ENV_FLAGS,
+        "--eval.n_episodes=4",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path}",
+    )
+    overall = json.loads((tmp_path / "eval_info.json").read_text())["overall"]
+    assert overall["n_episodes"] == 4
+    assert 0 <= overall["pc_success"] <= 100
+    assert len(overall["video_paths"]) == 4
+    assert all(Path(path).stat().st_size > 1000 for path in overall["video_paths"])
+
+
+def test_a_checkpoint_can_be_fine_tuned(dataset_root, checkpoint, tmp_path):
+    train(dataset_root, tmp_path / "tuned", "--steps=2", policy_flags=[f"--policy.path={checkpoint}"])
+    tuned = load_file(tmp_path / "tuned/checkpoints/last/pretrained_model/model.safetensors")
+    start = load_file(checkpoint / "model.safetensors")
+    name = "planner.denoiser.motion_head.weight"
+    assert not torch.equal(tuned[name], start[name])
+    torch.testing.assert_close(tuned[name], start[name], atol=0.01, rtol=0)
+
+
+def test_the_motion_alone_can_be_trained(dataset_root, tmp_path):
+    result = train(dataset_root, tmp_path / "diffuser", "--policy.plan_symbols=false", "--steps=2", "--log_freq=1")
+    assert "motion_loss" in result.stderr
+    assert "symbol_loss" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--policy.horizon=25"], "episodes have 19 to 19 frames, the planner's horizon is 25"),
+        (["--policy.preset=best"], "preset must be one of"),
+    ],
+)
+def test_training_refuses_what_does_not_fit(dataset_root, tmp_path, flags, message):
+    result = train(dataset_root, tmp_path / "run", *flags, check=False)
+    assert result.returncode != 0
+    assert message in result.stderr
+
+
+def test_an_output_folder_that_holds_a_run_is_not_overwritten(dataset_root, run_dir):
+    result = train(dataset_root, run_dir, check=False)
+    assert result.returncode != 0
+    assert "already exists" in result.stderr
+
+
+def test_hdp_plan_prints_and_draws_a_plan(checkpoint, tmp_path):
+    """The task is in the checkpoint's training configuration."""
+    result = run_command("hdp-plan", f"--policy.path={checkpoint}", f"--output_dir={tmp_path}", "--prompt=PICK b s1")
+    assert "plan:\n    PICK B S1 " in result.stdout
+    assert "executed: score" in result.stdout
+    from PIL import Image
+
+    assert Image.open(tmp_path / "plan.png").size[0] > 300
+    assert Image.open(tmp_path / "denoising.gif").n_frames == 11
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--prompt=PICK D"], "unknown symbol 'D' at position 2; the symbols are PAD A B PICK PLACE S1 S2 AUX"),
+        (["--prompt=" + "PICK " * 19], "19 symbols do not fit into a plan of 18"),
+        (["--policy.path=nowhere/to/be/found"], "nowhere/to/be/found"),
+    ],
+)
+def test_hdp_plan_answers_bad_input_with_one_line(checkpoint, tmp_path, flags, message):
+    arguments = {"--policy.path": f"--policy.path={checkpoint}"} | {flag.split("=")[0]: flag for flag in flags}
+    result = run_command("hdp-plan", *arguments.values(), f"--output_dir={tmp_path / 'none'}", check=False)
+    assert result.returncode == 1
+    assert message in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "none").exists()
+
+
+def test_lerobot_edit_dataset_keeps_the_vocabulary(dataset_root, tmp_path):
+    copy = tmp_path / "sorting"
+    shutil.copytree(dataset_root, copy)
+    run_command(
+        "lerobot-edit-dataset",
+        "--repo_id=test/sorting",
+        f"--root={copy}",
+        "--new_repo_id=test/shorter",
+        f"--new_root={tmp_path / 'shorter'}",
+        "--operation.type=delete_episodes",
+        "--operation.episode_indices=[0, 3]",
+    )
+    dataset = LeRobotDataset("test/shorter", root=tmp_path / "shorter", video_backend="pyav")
+    assert dataset.num_episodes == N_EPISODES - 2
+    assert dataset.meta.features["observation.symbolic_plan"]["info"]["vocabulary"][3] == "PICK"
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_a_train_config_fits_its_task(path):
+    config = TrainPipelineConfig.from_pretrained(path)
+    assert config.policy.horizon == config.env.planning_task.horizon
+    assert config.policy.push_to_hub is False

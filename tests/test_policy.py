@@ -1,0 +1,362 @@
+"""The planner as a LeRobot policy, in one process."""
+
+import pytest
+import torch
+from lerobot.policies import make_policy
+
+from lerobot_hdp import FREE, HDPConfig, PlanPrompt
+from lerobot_hdp.modeling_hdp import HDPPolicy
+
+from .conftest import HORIZON, TINY_PLANNER
+
+
+def observation(batch):
+    return {key: value for key, value in batch.items() if key in ("observation.state", "observation.environment_state")}
+
+
+def test_sizes_and_vocabulary_come_from_the_dataset(make_planner):
+    policy, *_ = make_planner()
+    assert policy.config.symbolic_horizon == 18
+    assert policy.config.vocabulary == ["PAD", "A", "B", "PICK", "PLACE", "S1", "S2", "AUX"]
+    assert set(policy.config.input_features) == {"observation.state", "observation.environment_state"}
+
+
+def test_tokens_survive_from_the_dataset_to_the_model_and_back_to_words(make_planner, batch, dataset):
+    policy, preprocessor, _ = make_planner()
+    tokens = preprocessor(batch)["observation.symbolic_plan"]
+    assert tokens.dtype == torch.int64
+    words = [policy.vocabulary.decode(row) for row in tokens]
+    for plan in words:
+        assert len(plan) == 18
+        assert plan[0::6] == ["PICK"] * 3
+        assert plan[3::6] == ["PLACE"] * 3
+        assert plan[5] == "AUX"
+    assert torch.equal(policy.vocabulary.encode(words[0], 18), dataset[0]["observation.symbolic_plan"])
+
+
+def test_loss_is_the_weighted_sum_of_its_logged_parts(make_planner, batch):
+    policy, preprocessor, _ = make_planner(symbol_loss_weight=0.25)
+    loss, parts = policy.train().forward(preprocessor(batch))
+    assert loss.item() == pytest.approx(parts["motion_loss"] + 0.25 * parts["symbol_loss"], rel=1e-5)
+
+
+def test_both_losses_fall_in_training(make_planner, batch):
+    policy, preprocessor, _ = make_planner(ema_max_decay=0)
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    inputs, history = preprocessor(batch), []
+    policy.train()
+    for _ in range(60):
+        loss, parts = policy.forward(inputs)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        history.append(parts)
+    for name in ("motion_loss", "symbol_loss"):
+        first, last = (sum(parts[name] for parts in part) for part in (history[:10], history[-10:]))
+        assert last < 0.7 * first
+
+
+def test_every_trainable_parameter_gets_a_gradient_and_is_optimised_once(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    policy.train().forward(preprocessor(batch))[0].backward()
+    trainable = {id(p): name for name, p in policy.named_parameters() if p.requires_grad}
+    assert all(p.grad is not None for p in policy.parameters() if p.requires_grad)
+    optimised = [id(p) for group in policy.get_optim_params() for p in group["params"]]
+    assert sorted(optimised) == sorted(trainable)
+
+
+def test_a_plan_is_whole_and_holds_no_mask(make_planner, batch):
+    policy, preprocessor, postprocessor = make_planner()
+    plan = policy.eval().plan(observation(preprocessor(batch)))
+    assert plan.actions.shape == (4, HORIZON, 3)
+    assert plan.token_ids.shape == plan.token_probabilities.shape == (4, 18)
+    assert plan.token_ids.max() < len(policy.vocabulary)
+    assert ((plan.token_probabilities > 0) & (plan.token_probabilities <= 1)).all()
+    assert plan.actions.abs().max() <= 1
+    assert postprocessor(plan.actions).shape == plan.actions.shape
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim"])
+@pytest.mark.parametrize("num_inference_steps", [1, 4, 10])
+def test_the_number_of_network_calls_is_the_users_choice(make_planner, batch, sampler, num_inference_steps):
+    policy, preprocessor, _ = make_planner(sampler=sampler, num_inference_steps=num_inference_steps)
+    calls = []
+    policy.eval()._planning_network.denoiser.register_forward_hook(lambda *_: calls.append(1))
+    policy.plan(observation(preprocessor(batch)))
+    assert len(calls) == num_inference_steps
+
+
+def test_the_same_generator_makes_the_same_plan(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    inputs = observation(preprocessor(batch))
+    plans = [policy.eval().plan(inputs, generator=torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
+    assert torch.equal(plans[0].actions, plans[1].actions)
+    assert torch.equal(plans[0].token_ids, plans[1].token_ids)
+    assert not torch.equal(plans[0].actions, plans[2].actions)
+
+
+def test_given_symbols_stay_fixed_in_every_step(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    token_ids = policy.vocabulary.encode_prompt("PICK _ S1 PLACE", 18).expand(4, -1)
+    states = []
+    prompt = PlanPrompt(token_ids=token_ids)
+    plan = policy.eval().plan(observation(preprocessor(batch)), prompt, on_step=lambda _, state: states.append(state))
+    given = token_ids != FREE
+    assert len(states) == 11
+    assert all(torch.equal(state.tokens[given], token_ids[given]) for state in states)
+    assert (states[0].tokens[~given] == policy.vocabulary.mask_id).all()
+    assert (plan.token_probabilities[given] == 1).all()
+
+
+def test_with_all_symbols_given_the_denoiser_is_told_that_they_are_clean(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    inputs, levels = preprocessor(batch), []
+    policy.eval()._planning_network.denoiser.register_forward_pre_hook(
+        lambda _, arguments: levels.append((arguments[3].max().item(), arguments[4].max().item()))
+    )
+    tokens = inputs["observation.symbolic_plan"]
+    plan = policy.plan(observation(inputs), PlanPrompt(token_ids=tokens))
+    assert torch.equal(plan.token_ids, tokens)
+    assert {k_d for _, k_d in levels} == {0.0}
+    assert levels[0][0] == 1.0
+
+
+def test_with_the_motion_given_only_symbols_are_sampled(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    inputs, levels = preprocessor(batch), []
+    policy.eval()._planning_network.denoiser.register_forward_pre_hook(
+        lambda _, arguments: levels.append((arguments[3].max().item(), arguments[4].max().item()))
+    )
+    plan = policy.plan(observation(inputs), PlanPrompt(actions=inputs["action"]))
+    assert torch.equal(plan.actions, inputs["action"])
+    assert {k_c for k_c, _ in levels} == {0.0}
+    assert levels[0][1] == 1.0
+    assert plan.token_ids.max() < len(policy.vocabulary)
+
+
+def test_the_beginning_of_the_motion_can_be_given(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    inputs = preprocessor(batch)
+    given = torch.zeros(4, HORIZON, dtype=torch.bool)
+    given[:, :7] = True
+    plan = policy.eval().plan(observation(inputs), PlanPrompt(actions=inputs["action"], actions_given=given))
+    assert torch.equal(plan.actions[:, :7], inputs["action"][:, :7])
+    assert not torch.equal(plan.actions[:, 7:], inputs["action"][:, 7:])
+
+
+def test_a_prompt_from_the_environment_is_followed(make_planner, batch):
+    """LeRobot hands an environment's observation over as floats."""
+    policy, preprocessor, _ = make_planner()
+    prompt = torch.full((4, 18), float(FREE))
+    prompt[:, 0] = policy.vocabulary.encode("PICK", 1)
+    inputs = preprocessor({**observation(batch), "observation.symbolic_plan": prompt})
+    plan = policy.eval().plan(inputs)
+    assert [policy.vocabulary.symbols[i] for i in plan.token_ids[:, 0]] == ["PICK"] * 4
+
+
+def test_select_action_plays_the_plan_open_loop(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    inputs = observation(preprocessor(batch))
+    policy.eval().reset()
+    torch.manual_seed(3)
+    plan = policy.plan(inputs).actions
+    torch.manual_seed(3)
+    played = torch.stack([policy.select_action(inputs) for _ in range(HORIZON)], dim=1)
+    assert torch.equal(played, plan)
+
+
+def test_a_smaller_n_action_steps_replans(make_planner, batch):
+    policy, preprocessor, _ = make_planner(n_action_steps=5)
+    inputs = observation(preprocessor(batch))
+    assert policy.eval().predict_action_chunk(inputs).shape == (4, 5, 3)
+    calls = []
+    policy._planning_network.denoiser.register_forward_hook(lambda *_: calls.append(1))
+    for _ in range(11):
+        policy.select_action(inputs)
+    assert len(calls) == 3 * policy.config.num_train_timesteps
+
+
+def test_a_planner_without_symbols_is_diffuser(make_planner, batch):
+    policy, preprocessor, _ = make_planner(plan_symbols=False)
+    inputs = preprocessor(batch)
+    loss, parts = policy.train().forward(inputs)
+    assert set(parts) == {"motion_loss"}
+    assert loss.item() == pytest.approx(parts["motion_loss"])
+    plan = policy.eval().plan(inputs)
+    assert plan.token_ids is None
+    assert plan.symbols() == []
+
+
+def test_any_frame_trains_on_what_remains(make_planner, dataset):
+    policy, *_ = make_planner(plan_from="any_frame")
+    assert policy.config.drop_n_last_frames == 0
+    item = dataset[7]
+    assert torch.equal(item["action"][-7:], item["action"][-1].expand(7, -1))
+    assert len(policy.vocabulary.decode(item["observation.symbolic_plan"])) == 12
+
+
+def test_planning_uses_the_moving_average_of_the_weights(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    inputs = preprocessor(batch)
+    name, weight = next(iter(policy.planner.named_parameters()))
+    expected = weight.detach().clone()
+    for update in range(5):
+        policy.train().forward(inputs)[0].backward()
+        optimizer.step()
+        policy.update()
+        decay = 0.0 if update == 0 else min(1 - (1 + update) ** -0.75, 0.9999)
+        expected = decay * expected + (1 - decay) * weight.detach()
+    torch.testing.assert_close(dict(policy.ema.module.named_parameters())[name].detach(), expected)
+    assert policy._planning_network is policy.ema.module
+
+
+def test_the_noise_of_a_training_step_does_not_depend_on_the_global_generator(make_planner, batch):
+    """LeRobot's data loader draws from it at every epoch, which a resumed run does at other steps."""
+    losses = []
+    for draws in (0, 3):
+        policy, preprocessor, _ = make_planner(dropout=0.5)
+        torch.rand(draws)
+        losses.append([policy.train().forward(preprocessor(batch))[0].item() for _ in range(3)])
+    assert losses[0] == losses[1]
+    assert len(set(losses[0])) == 3
+
+
+def test_a_checkpoint_plans_the_same(make_planner, batch, tmp_path):
+    policy, preprocessor, _ = make_planner()
+    policy.save_pretrained(tmp_path)
+    loaded = HDPPolicy.from_pretrained(tmp_path)
+    inputs = observation(preprocessor(batch))
+    first, second = (p.eval().plan(inputs, generator=torch.Generator().manual_seed(0)) for p in (policy, loaded))
+    assert torch.equal(first.actions, second.actions)
+    assert first.symbols() == second.symbols()
+
+
+def test_bfloat16_can_be_switched_on(make_planner, batch):
+    policy, preprocessor, _ = make_planner(dtype="bfloat16")
+    inputs = preprocessor(batch)
+    with torch.autocast("cpu", torch.bfloat16):
+        loss, _ = policy.train().forward(inputs)
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert policy.eval().plan(observation(inputs)).actions.dtype == torch.float32
+
+
+def test_compilation_changes_neither_the_plan_nor_the_checkpoint(make_planner, batch):
+    plans = []
+    for compile_model in (False, True):
+        policy, preprocessor, _ = make_planner(compile_model=compile_model, num_inference_steps=1)
+        assert not any("_orig_mod" in key for key in policy.state_dict())
+        inputs = observation(preprocessor(batch))
+        plans.append(policy.eval().plan(inputs, generator=torch.Generator().manual_seed(0)))
+    torch.testing.assert_close(plans[0].actions, plans[1].actions, atol=1e-4, rtol=0)
+
+
+class TestPaperPreset:
+    def test_has_the_papers_values(self):
+        config = HDPConfig(preset="paper", horizon=145, device="cpu")
+        assert (config.num_layers, config.num_heads, config.width, config.dropout) == (8, 4, 256, 0.3)
+        assert (config.prediction_type, config.num_train_timesteps, config.symbol_loss_weight) == (
+            "epsilon",
+            100,
+            1 / 30,
+        )
+        optimizer, scheduler = config.get_optimizer_preset(), config.get_scheduler_preset()
+        assert (optimizer.lr, optimizer.betas, optimizer.weight_decay) == (1e-4, (0.9, 0.95), 1e-3)
+        assert scheduler.num_warmup_steps == 1000
+
+    def test_explicit_values_win(self):
+        assert HDPConfig(preset="paper", dropout=0.1, device="cpu").dropout == 0.1
+
+    def test_symbols_add_about_one_percent_of_parameters(self, make_planner):
+        """The paper: 'an increase in parameter count by about 1 %'."""
+        sizes = {"num_layers": 8, "num_heads": 4, "width": 256, "preset": "paper", "symbolic_horizon": 108}
+        hybrid, motion_only = (
+            sum(p.numel() for p in make_planner(**sizes, plan_symbols=symbols)[0].planner.parameters())
+            for symbols in (True, False)
+        )
+        assert 0.005 < hybrid / motion_only - 1 < 0.02
+
+    def test_plans_are_filled_with_pad(self, make_planner, batch):
+        policy, preprocessor, _ = make_planner(symbolic_horizon=108)
+        tokens = preprocessor(batch)["observation.symbolic_plan"]
+        assert tokens.shape == (4, 108)
+        assert (tokens[:, 18:] == 0).all()
+        assert policy.eval().plan(observation(preprocessor(batch))).token_ids.shape == (4, 108)
+
+
+class TestBadInput:
+    def test_nan_in_an_observation(self, make_planner, batch):
+        policy, preprocessor, _ = make_planner()
+        inputs = observation(preprocessor(batch))
+        inputs["observation.state"][2, 0] = torch.nan
+        with pytest.raises(ValueError, match=r"observation.state holds NaN or infinity"):
+            policy.eval().plan(inputs)
+
+    def test_a_prompt_of_the_wrong_length(self, make_planner, batch):
+        policy, preprocessor, _ = make_planner()
+        prompt = PlanPrompt(token_ids=torch.zeros(4, 20, dtype=torch.int64))
+        with pytest.raises(ValueError, match=r"shape \(4, 18\), got \(4, 20\)"):
+            policy.eval().plan(observation(preprocessor(batch)), prompt)
+
+    def test_a_token_id_without_a_symbol(self, make_planner, batch):
+        _, preprocessor, _ = make_planner()
+        batch["observation.symbolic_plan"][0, 0] = 8
+        with pytest.raises(ValueError, match="token id 8, which is none of the 8 symbols"):
+            preprocessor(batch)
+
+    def test_a_horizon_that_is_not_the_episodes(self, make_planner):
+        with pytest.raises(ValueError, match=r"episodes have 19 to 19 frames, the planner's horizon is 20"):
+            make_planner(horizon=20)
+
+    def test_no_horizon(self):
+        with pytest.raises(ValueError, match=r"--policy.horizon is missing"):
+            _ = HDPConfig(device="cpu").action_delta_indices
+
+    def test_a_dataset_without_symbols(self, dataset):
+        config = HDPConfig(**TINY_PLANNER, device="cpu")
+        features = {k: v for k, v in dataset.meta.features.items() if k != "observation.symbolic_plan"}
+        with pytest.raises(ValueError, match=r"--policy.plan_symbols=false"):
+            config.set_dataset_feature_metadata(features)
+
+    def test_another_vocabulary_than_the_checkpoints(self, dataset):
+        config = HDPConfig(**TINY_PLANNER, vocabulary=["PAD", "X", "Y"], device="cpu")
+        with pytest.raises(ValueError, match="is not the checkpoint's PAD X Y"):
+            make_policy(config, ds_meta=dataset.meta)
+
+    def test_plans_longer_than_the_symbolic_horizon(self, make_planner):
+        with pytest.raises(ValueError, match="symbolic_horizon=12 is shorter than the dataset's plans of 18"):
+            make_planner(symbolic_horizon=12)
+
+    @pytest.mark.parametrize("damage", ["truncated", "missing"])
+    def test_a_damaged_checkpoint(self, make_planner, tmp_path, damage):
+        policy, *_ = make_planner()
+        policy.save_pretrained(tmp_path)
+        weights = tmp_path / "model.safetensors"
+        if damage == "truncated":
+            weights.write_bytes(weights.read_bytes()[:1000])
+            with pytest.raises(ValueError, match="damaged or incomplete"):
+                HDPPolicy.from_pretrained(tmp_path)
+        else:
+            weights.unlink()
+            with pytest.raises(FileNotFoundError, match="missing from the checkpoint"):
+                HDPPolicy.from_pretrained(tmp_path)
+
+    @pytest.mark.parametrize(
+        "field",
+        [
+            {"preset": "best"},
+            {"prediction_type": "noise"},
+            {"sampler": "euler"},
+            {"plan_from": "middle"},
+            {"dtype": "float8"},
+            {"n_obs_steps": 2},
+            {"width": 30, "num_heads": 4},
+            {"horizon": 0},
+            {"horizon": 10, "n_action_steps": 11},
+            {"num_inference_steps": 101},
+        ],
+    )
+    def test_impossible_settings(self, field):
+        with pytest.raises(ValueError, match=next(iter(field))):
+            HDPConfig(**field, device="cpu")

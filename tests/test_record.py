@@ -1,0 +1,174 @@
+"""`hdp-record`: the data contract, interruptions, and what cannot be recorded."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from dataset_tools.experts import EXPERTS
+from dataset_tools.record import RecordConfig, RecordDatasetConfig, episode_seed, record
+from gym_hdp_tasks.env_config import HDPEnv
+
+from .conftest import HORIZON, N_EPISODES, TASK_FLAGS, run_command
+
+
+def columns(root: Path) -> dict[str, np.ndarray]:
+    dataset = LeRobotDataset("test/sorting", root=root, video_backend="pyav").hf_dataset.with_format("numpy")
+    return {key: np.stack(dataset[key]) for key in dataset.column_names}
+
+
+def assert_same_dataset(first: Path, second: Path) -> None:
+    one, other = columns(first), columns(second)
+    assert one.keys() == other.keys()
+    assert all(np.array_equal(one[key], other[key]) for key in one)
+
+
+@pytest.fixture(scope="module")
+def recorded(dataset_root):
+    return columns(dataset_root)
+
+
+def test_writes_the_data_contract(dataset_root, recorded):
+    features = json.loads((dataset_root / "meta/info.json").read_text())["features"]
+    expected = {
+        "observation.state": ("float32", [3]),
+        "observation.environment_state": ("float32", [4]),
+        "action": ("float32", [3]),
+        "observation.symbolic_plan": ("int64", [18]),
+        "next.reward": ("float32", [1]),
+        "next.success": ("bool", [1]),
+        "next.done": ("bool", [1]),
+    }
+    assert {key: (features[key]["dtype"], features[key]["shape"]) for key in expected} == expected
+    assert len(recorded["action"]) == N_EPISODES * HORIZON
+
+
+def test_a_dataset_explains_itself(dataset_root):
+    info = json.loads((dataset_root / "meta/info.json").read_text())["features"]["observation.symbolic_plan"]["info"]
+    assert info["vocabulary"] == ["PAD", "A", "B", "PICK", "PLACE", "S1", "S2", "AUX"]
+    assert info["gym_id"] == "hdp/BlockSorting2D-v0"
+    assert info["parameters"] == {"n_blocks": 2, "waypoints_per_pose": 1}
+    assert (info["seed"], info["failed_attempts"]) == (0, {})
+
+
+def test_episodes_are_whole_and_successful(recorded):
+    by_episode = {key: value.reshape(N_EPISODES, HORIZON, -1) for key, value in recorded.items()}
+    last = np.zeros(HORIZON)
+    last[-1] = 1
+    for key in ("next.reward", "next.success", "next.done"):
+        assert (by_episode[key][..., 0] == last).all()
+    assert np.array_equal(by_episode["action"][:, 0], by_episode["observation.state"][:, 0])
+    assert len(np.unique(by_episode["observation.environment_state"][:, 0], axis=0)) == N_EPISODES
+
+
+def test_the_plan_column_is_what_remains(recorded):
+    plans = recorded["observation.symbolic_plan"].reshape(N_EPISODES, HORIZON, 18)
+    assert ((plans != 0).sum(axis=2) == np.repeat([18, 12, 6], [7, 6, 6])).all()
+    assert np.array_equal(plans[:, 7, :12], plans[:, 0, 6:])
+
+
+def test_the_card_shows_a_plan_in_words(dataset_root):
+    card = (dataset_root / "README.md").read_text()
+    assert "PICK" in card
+    assert "PLACE" in card
+    assert "hybrid-diffusion-planning" in card
+
+
+def test_recorded_actions_replay_to_the_recorded_score(recorded):
+    import gymnasium as gym
+
+    env = gym.make("hdp/BlockSorting2D-v0", n_blocks=2, waypoints_per_pose=1)
+    for episode in range(N_EPISODES):
+        rows = slice(episode * HORIZON, (episode + 1) * HORIZON)
+        env.reset(seed=episode_seed(0, episode))
+        for action, reward in zip(recorded["action"][rows], recorded["next.reward"][rows], strict=True):
+            assert env.step(action)[1] == reward
+
+
+def test_the_result_does_not_depend_on_the_number_of_processes(dataset_root, tmp_path):
+    root = tmp_path / "two_workers"
+    flags = ("--dataset.repo_id=test/sorting", f"--dataset.root={root}", f"--dataset.num_episodes={N_EPISODES}")
+    run_command("hdp-record", *TASK_FLAGS, *flags, "--num_workers=2")
+    assert_same_dataset(dataset_root, root)
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGKILL])
+def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, signal_number):
+    def flags(name):
+        return (*TASK_FLAGS, "--dataset.repo_id=t/t", f"--dataset.root={tmp_path / name}", "--dataset.num_episodes=80")
+
+    executable = Path(sys.executable).with_name("hdp-record")
+    process = subprocess.Popen([executable, *flags("stopped")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    first_shard_done = tmp_path / "stopped.partial" / "episodes_000000.done"
+    while not first_shard_done.exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal_number)
+    process.wait()
+    assert not (tmp_path / "stopped").exists()
+
+    refused = run_command("hdp-record", *flags("stopped"), check=False)
+    assert refused.returncode == 1
+    assert refused.stderr.count("\n") == 1
+    assert "--resume=true" in refused.stderr
+    finished = first_shard_done.stat().st_mtime_ns
+    run_command("hdp-record", *flags("stopped"), "--resume=true")
+    assert finished  # the first shard was there before the second run
+    run_command("hdp-record", *flags("whole"))
+    assert_same_dataset(tmp_path / "stopped", tmp_path / "whole")
+    assert not (tmp_path / "stopped.partial").exists()
+
+
+def test_failed_demonstrations_are_dropped_and_counted(tmp_path, monkeypatch, capsys):
+    """An expert that now and then forgets to open the gripper at the end."""
+    expert = EXPERTS["hdp/BlockSorting2D-v0"]
+
+    def careless(env, rng):
+        demonstration = expert(env, rng)
+        if rng.random() < 0.4:
+            demonstration.waypoints[-1, 2] = 0.0
+        return demonstration
+
+    monkeypatch.setitem(EXPERTS, "hdp/BlockSorting2D-v0", careless)
+    config = RecordConfig(
+        dataset=RecordDatasetConfig(repo_id="test/careless", root=tmp_path / "careless", num_episodes=10),
+        env=HDPEnv(n_blocks=2, waypoints_per_pose=1),
+    )
+    dataset = record(config)
+    failed = dataset.meta.features["observation.symbolic_plan"]["info"]["failed_attempts"]
+    assert dataset.num_episodes == 10
+    assert columns(tmp_path / "careless")["next.success"].reshape(10, HORIZON)[:, -1].all()
+    assert sum(failed.values()) > 0
+    assert f"dropped {sum(failed.values())} of {10 + sum(failed.values())}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--env.task=Juggling-v0",), "is not a task of --env.type=hdp"),
+        (("--env.n_blocks=1",), "n_blocks must be in [2, 8]"),
+        (("--dataset.num_episodes=0",), "must be at least 1"),
+    ],
+)
+def test_bad_flags_are_one_line_and_leave_nothing_behind(tmp_path, flags, message):
+    root = tmp_path / "nothing"
+    result = run_command("hdp-record", "--dataset.repo_id=t/t", f"--dataset.root={root}", *flags, check=False)
+    assert result.returncode != 0
+    assert message in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_dataset_is_not_overwritten(dataset_root):
+    before = (dataset_root / "meta/info.json").read_bytes()
+    flags = (*TASK_FLAGS, "--dataset.repo_id=test/sorting", f"--dataset.root={dataset_root}")
+    result = run_command("hdp-record", *flags, check=False)
+    assert result.returncode == 1
+    assert "exists already" in result.stderr
+    assert (dataset_root / "meta/info.json").read_bytes() == before
