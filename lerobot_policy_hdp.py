@@ -1,8 +1,9 @@
 """What LeRobot's plugin discovery imports: registers policies, their processor steps and the environments."""
 
-import gym_hdp_tasks.env_config  # noqa: F401
+import gym_hdp_tasks.env_config
 import lerobot_hdp.configuration_hdp
-import lerobot_hdp.processor_hdp  # noqa: F401
-from lerobot_hdp.torchcodec_warning import shorten_torchcodec_warning
+import lerobot_hdp.processor_hdp
+from lerobot_hdp.lerobot_workarounds import keep_data_order_on_resume, shorten_torchcodec_warning
 
+keep_data_order_on_resume()
 shorten_torchcodec_warning()

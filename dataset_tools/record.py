@@ -83,7 +83,7 @@ class RecordConfig:
 
     def __post_init__(self):
         if self.dataset.num_episodes < 1 or self.num_workers < 1:
-            raise ValueError("--dataset.num_episodes and --num_workers must be at least 1")
+            raise ParsingError("--dataset.num_episodes and --num_workers must be at least 1")
 
     @property
     def root(self) -> Path:
@@ -349,9 +349,7 @@ def main() -> None:
         _main()
     except KeyboardInterrupt:
         sys.exit("hdp-record: interrupted; go on with --resume=true")
-    except ParsingError as error:  # draccus wraps what a configuration object objects to
-        sys.exit(f"hdp-record: {error.__cause__ or error}")
-    except (ValueError, FileExistsError) as error:
+    except (ParsingError, ValueError, FileExistsError) as error:
         sys.exit(f"hdp-record: {error}")
 
 

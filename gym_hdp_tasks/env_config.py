@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
@@ -33,7 +34,10 @@ class HDPEnv(EnvConfig):
     render_mode: str = "rgb_array"
 
     def __post_init__(self):
-        task = self.planning_task
+        try:
+            task = self.planning_task
+        except ValueError as error:  # LeRobot's commands show the message of draccus' own error only
+            raise ParsingError(str(error)) from error
         self.fps = task.fps
         self.features = {
             "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(len(task.state_names),)),

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+from draccus.utils import ParsingError
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
@@ -67,6 +68,10 @@ class HDPConfig(PreTrainedConfig):
         dtype: `float32`, or `bfloat16` for autocast in training and planning.
 
         optimizer_*, scheduler_*: AdamW with a linear warm-up and a cosine decay to the last step.
+
+    Raises:
+        ParsingError: a value that cannot be. It is draccus' own error, because LeRobot's commands hide the message of
+            a ValueError behind "Couldn't instantiate class".
     """
 
     preset: str = "default"
@@ -122,17 +127,19 @@ class HDPConfig(PreTrainedConfig):
         _check_choice("sampler", self.sampler, ["ddpm", "ddim"])
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
         if self.n_obs_steps != 1:
-            raise ValueError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
+            raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
         if self.width % self.num_heads or self.width % 2:
-            raise ValueError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
+            raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
         for name in ("horizon", "symbolic_horizon", "n_action_steps", "num_inference_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+                raise ParsingError(f"{name} must be at least 1, got {value}")
         if self.horizon and self.n_action_steps and self.n_action_steps > self.horizon:
-            raise ValueError(f"n_action_steps={self.n_action_steps} is more than the plan has ({self.horizon=})")
+            raise ParsingError(f"n_action_steps={self.n_action_steps} is more than the plan has ({self.horizon=})")
         if self.num_inference_steps and self.num_inference_steps > self.num_train_timesteps:
-            raise ValueError(f"num_inference_steps={self.num_inference_steps} is more than {self.num_train_timesteps=}")
+            raise ParsingError(
+                f"num_inference_steps={self.num_inference_steps} is more than {self.num_train_timesteps=}"
+            )
 
     def set_dataset_feature_metadata(self, features: dict[str, dict]) -> None:
         """Take over what the dataset says about its symbolic plans. LeRobot calls this before it builds the policy.
@@ -215,4 +222,4 @@ class HDPConfig(PreTrainedConfig):
 
 def _check_choice(name: str, value: Any, choices: list[str]) -> None:
     if value not in choices:
-        raise ValueError(f"{name} must be one of {choices}, got {value!r}")
+        raise ParsingError(f"{name} must be one of {choices}, got {value!r}")

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from draccus.utils import ParsingError
 from lerobot.policies import make_policy
 
 from lerobot_hdp import FREE, HDPConfig, PlanPrompt
@@ -358,5 +359,5 @@ class TestBadInput:
         ],
     )
     def test_impossible_settings(self, field):
-        with pytest.raises(ValueError, match=next(iter(field))):
+        with pytest.raises(ParsingError, match=next(iter(field))):
             HDPConfig(**field, device="cpu")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+from draccus.utils import ParsingError
 from lerobot import envs, policies  # noqa: F401 (registers LeRobot's own)
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
@@ -188,7 +189,7 @@ def main() -> None:
     register_third_party_plugins()
     try:
         _main()
-    except ParsingError as error:  # draccus wraps what a configuration object objects to
+    except ParsingError as error:  # draccus wraps what happens while a checkpoint's configuration is read
         sys.exit(f"hdp-plan: {error.__cause__ or error}")
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"hdp-plan: {error}")

@@ -1,0 +1,56 @@
+"""The two places where the plugin touches LeRobot itself (0.6.1), each with what would make it unnecessary."""
+
+import logging
+
+from lerobot.datasets.sampler import EpisodeAwareSampler
+
+
+def keep_data_order_on_resume() -> None:
+    """Let a resumed run go on in the epoch where it stopped.
+
+    `lerobot-train` restores the sampler's epoch, but Accelerate's loader counts its epochs from 0 again and tells the
+    sampler so: after the first epoch, a resumed run sees other data than an uninterrupted one. The difference between
+    what was restored and what the loader says first is added to all that it says from then on.
+
+    To be removed with LeRobot pull request 4692, after which that difference is 0.
+    """
+    set_epoch, load_state_dict = EpisodeAwareSampler.set_epoch, EpisodeAwareSampler.load_state_dict
+    if getattr(set_epoch, "keeps_data_order", False):
+        return
+
+    def load_state_dict_and_remember(self: EpisodeAwareSampler, state: dict) -> None:
+        load_state_dict(self, state)
+        self._restored_epoch = state["epoch"]
+
+    def set_shifted_epoch(self: EpisodeAwareSampler, epoch: int) -> None:
+        if hasattr(self, "_restored_epoch"):
+            self._epoch_shift = self._restored_epoch - epoch
+            del self._restored_epoch
+        set_epoch(self, epoch + getattr(self, "_epoch_shift", 0))
+
+    set_shifted_epoch.keeps_data_order = True  # type: ignore[attr-defined]
+    EpisodeAwareSampler.load_state_dict = load_state_dict_and_remember
+    EpisodeAwareSampler.set_epoch = set_shifted_epoch
+
+
+def shorten_torchcodec_warning() -> None:
+    """Say in one line, not a page, that torchcodec finds no FFmpeg.
+
+    LeRobot tries torchcodec whenever it parses a training configuration, logs a traceback for each FFmpeg version
+    that it does not find, and then uses PyAV. To be removed when it says so in one line itself.
+    """
+    for name in ("lerobot.utils.import_utils", "lerobot.datasets.video_utils"):
+        logging.getLogger(name).addFilter(_Shorten())
+
+
+class _Shorten(logging.Filter):
+    def __init__(self):
+        super().__init__()
+        self.said = False
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if "libtorchcodec" not in record.getMessage():
+            return True
+        record.msg, record.args = "torchcodec finds no FFmpeg libraries; videos are decoded by PyAV instead.", ()
+        first, self.said = not self.said, True
+        return first
