@@ -123,7 +123,8 @@ def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
 def demonstrate(env: gym.Env, expert: Expert, seed: int) -> Episode:
     """Reset the environment, let the expert plan, and execute its plan to the end."""
     observation, _ = env.reset(seed=seed)
-    demonstration = expert(env, np.random.default_rng(seed))
+    # Not the seed alone: that would be the environment's own stream, and the choices would follow from the start.
+    demonstration = expert(env, np.random.default_rng([seed, 1]))
     task: PlanningTask = env.unwrapped.planning_task  # type: ignore[attr-defined]
     frames, score = [], 0.0
     for frame, action in enumerate(demonstration.waypoints):

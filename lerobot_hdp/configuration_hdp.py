@@ -7,7 +7,9 @@ from draccus.utils import ParsingError
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import OBS_PREFIX
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
+
+from .encoders import object_sizes
 
 OBS_SYMBOLIC_PLAN = f"{OBS_PREFIX}symbolic_plan"
 """Dataset column with the plan's token ids; from an environment, the plan's prompt. It has this name because LeRobot
@@ -18,6 +20,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "default": {
         "prediction_type": "sample",
         "dropout": 0.0,
+        "object_tokens": True,
         "optimizer_lr": 1e-3,
         "scheduler_warmup_steps": 100,
     },
@@ -26,6 +29,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "prediction_type": "epsilon",
         "dropout": 0.3,
+        "object_tokens": False,
         "optimizer_lr": 1e-4,
         "scheduler_warmup_steps": 1000,
     },
@@ -54,6 +58,9 @@ class HDPConfig(PreTrainedConfig):
         vocabulary: the symbols, PAD first; read from the dataset.
 
         num_layers, num_heads, width, dropout: the transformer; `width` is the size of a token.
+        object_tokens: True makes a condition token of each object in `observation.environment_state` (its components
+            are named `object.component` in the dataset) and one of each other observation; False makes one of all.
+        observation_token_sizes: how many numbers become each condition token; follows from the dataset.
         num_train_timesteps: N, steps of the Gaussian process.
         prediction_type: what is predicted of the motion: `epsilon` (the noise), `sample` (the clean motion) or
             `v_prediction`.
@@ -87,6 +94,8 @@ class HDPConfig(PreTrainedConfig):
     num_heads: int = 4
     width: int = 256
     dropout: float | None = None
+    object_tokens: bool | None = None
+    observation_token_sizes: list[int] | None = None
     num_train_timesteps: int = 100
     prediction_type: str | None = None
     symbol_loss_weight: float = 1 / 30
@@ -142,14 +151,29 @@ class HDPConfig(PreTrainedConfig):
             )
 
     def set_dataset_feature_metadata(self, features: dict[str, dict]) -> None:
-        """Take over what the dataset says about its symbolic plans. LeRobot calls this before it builds the policy.
+        """Take over what the dataset says about itself. LeRobot calls this before it builds the policy.
 
         Raises:
             ValueError: the dataset has no symbolic plans, they do not fit, or they speak another vocabulary.
         """
         self.input_features.pop(OBS_SYMBOLIC_PLAN, None)  # token ids are no numbers to normalise
-        if not self.plan_symbols:
-            return
+        if self.observation_token_sizes is None:
+            self.observation_token_sizes = self._token_sizes(features)
+        if self.plan_symbols:
+            self._set_symbols(features)
+
+    def _token_sizes(self, features: dict[str, dict]) -> list[int]:
+        """Sizes of the condition tokens, see `object_tokens`."""
+        if not self.object_tokens:
+            return [sum(feature.shape[0] for feature in self.input_features.values())]
+        sizes = []
+        for key, feature in self.input_features.items():
+            names = features[key].get("names")
+            has_objects = key == OBS_ENV_STATE and isinstance(names, list)
+            sizes += object_sizes(names) if has_objects else [feature.shape[0]]
+        return sizes
+
+    def _set_symbols(self, features: dict[str, dict]) -> None:
         if OBS_SYMBOLIC_PLAN not in features:
             raise ValueError(
                 f"the dataset has no column '{OBS_SYMBOLIC_PLAN}'. Add one (README, 'Your own dataset'), or train "
@@ -181,8 +205,9 @@ class HDPConfig(PreTrainedConfig):
             raise ValueError("the planner needs at least one of observation.state and observation.environment_state")
         if self.action_feature is None:
             raise ValueError("the dataset has no column 'action'")
-        if self.plan_symbols and not (self.vocabulary and self.symbolic_horizon):
-            raise ValueError("vocabulary and symbolic_horizon are unknown: train on a dataset with symbolic plans")
+        symbols_known = self.vocabulary is not None and self.symbolic_horizon is not None
+        if self.observation_token_sizes is None or (self.plan_symbols and not symbols_known):
+            raise ValueError("a planner learns its sizes and its vocabulary from a dataset: train it before use")
 
     @property
     def drop_n_last_frames(self) -> int:

@@ -1,30 +1,47 @@
 """Observation -> condition tokens."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import groupby
 
 import torch
-from lerobot.configs import PolicyFeature
 from torch import Tensor, nn
 
 
 class StateEncoder(nn.Module):
-    """One condition token from all low-dimensional observations, as in Diffusion Policy's transformer.
+    """Condition tokens from the low-dimensional observations.
+
+    The observations are concatenated and cut into parts; each part becomes a token. One part is Diffusion Policy's
+    way. With a part for each object, attention can look up the one that a symbol names, instead of finding its
+    numbers in a vector of all.
 
     Args:
-        features: the observations by name; they are concatenated in this order.
+        keys: names of the observations, in the order in which they are concatenated.
+        token_sizes: size of each part.
         width: size of a token.
     """
 
-    def __init__(self, features: Mapping[str, PolicyFeature], width: int):
+    def __init__(self, keys: Iterable[str], token_sizes: Iterable[int], width: int):
         super().__init__()
-        self.keys = list(features)
-        self.projection = nn.Linear(sum(feature.shape[0] for feature in features.values()), width)
+        self.keys = list(keys)
+        self.token_sizes = list(token_sizes)
+        self.projections = nn.ModuleList(nn.Linear(size, width) for size in self.token_sizes)
 
     @property
     def num_tokens(self) -> int:
-        return 1
+        return len(self.token_sizes)
 
     def forward(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Observations (B, n) or (B, 1, n) each -> (B, 1, width)."""
-        states = [batch[key].flatten(1) for key in self.keys]
-        return self.projection(torch.cat(states, dim=-1)).unsqueeze(1)
+        """Observations (B, n) or (B, 1, n) each -> (B, num_tokens, width)."""
+        state = torch.cat([batch[key].flatten(1) for key in self.keys], dim=-1)
+        parts = state.split(self.token_sizes, dim=-1)
+        return torch.stack([project(part) for project, part in zip(self.projections, parts, strict=True)], dim=1)
+
+
+def object_sizes(names: Iterable[str]) -> list[int]:
+    """How many consecutive components belong to each object; they are named `object.component`.
+
+    Example:
+        >>> object_sizes(["red.x", "red.y", "blue.x", "blue.y"])
+        [2, 2]
+    """
+    return [len(list(group)) for _, group in groupby(names, key=lambda name: name.rpartition(".")[0])]

@@ -26,7 +26,7 @@ class Planner(nn.Module):
 
     def __init__(self, config: HDPConfig):
         super().__init__()
-        self.encoder = StateEncoder(config.input_features, config.width)
+        self.encoder = StateEncoder(config.input_features, config.observation_token_sizes, config.width)
         self.denoiser = Denoiser(
             action_dim=config.action_feature.shape[0],
             horizon=config.horizon,

@@ -1,0 +1,34 @@
+"""What a result has to say about where it comes from."""
+
+import os
+import platform
+import subprocess
+import sys
+from importlib.metadata import version
+
+
+def describe_run() -> dict[str, object]:
+    """The command, the code, the machine and the versions of the packages that matter, for a results file."""
+    return {
+        "command": "python -m " + " ".join([_module_name(), *sys.argv[1:]]),
+        "git_commit": _git("rev-parse", "--short", "HEAD") + ("+changes" if _git("status", "--porcelain") else ""),
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in ("lerobot", "torch", "gymnasium", "mujoco", "numpy")},
+    }
+
+
+def _module_name() -> str:
+    specification = sys.modules["__main__"].__spec__
+    return specification.name if specification else sys.argv[0]
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], capture_output=True, text=True, check=False).stdout.strip()
+
+
+def _cpu_name() -> str:
+    with open("/proc/cpuinfo") as file:
+        names = [line.split(":")[1].strip() for line in file if line.startswith("model name")]
+    return names[0] if names else platform.processor()
