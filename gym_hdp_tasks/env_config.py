@@ -50,7 +50,9 @@ class HDPEnv(EnvConfig):
             ValueError: there is no such task, or it cannot have these parameters.
         """
         if self.task not in TASKS:
-            raise ValueError(f"--env.task={self.task} is not a task of --env.type=hdp; choose one of {list(TASKS)}")
+            raise ValueError(
+                f"--env.task={self.task} is not a task of --env.type=hdp; choose one of {list(TASKS)}"
+            )
         return TASKS[self.task](**self._task_parameters)
 
     @property

@@ -1,0 +1,87 @@
+"""The xArm7 with a parallel gripper, as an `MjSpec` to put a scene around.
+
+Two models answer to the same names: joints `joint1` ... `joint7`, site `tcp` midway between the pads, a tendon and an
+actuator that open the gripper, and geoms whose names end in `_pad`.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+
+ROBOTS = ("primitive", "menagerie")
+"""`primitive` ships with this package; `menagerie` is MuJoCo Menagerie's `ufactory_xarm7` (extra `menagerie`)."""
+
+ARM_JOINTS = tuple(f"joint{i}" for i in range(1, 8))
+HOME_JOINTS = (0.0, -0.247, 0.0, 0.909, 0.0, 1.15644, 0.0)
+"""In radians: the gripper points down, in front of the base."""
+MAX_JOINT_SPEED = 3.14
+"""In rad/s, the real arm's limit (180 degrees per second) for each joint."""
+ROBOT_CONTYPE = 2
+"""Contact type of the robot's geoms: they meet the scene's geoms, never each other."""
+TCP_SITE = "tcp"
+WRIST_CAMERA = "wrist"
+
+_PRIMITIVE_XML = Path(__file__).parent / "assets" / "xarm7.xml"
+_MENAGERIE_TCP_DEPTH = 0.155
+"""In metres from the gripper's base to between its pads; Menagerie's own `link_tcp` (0.172) lies beyond their ends."""
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """How an opening in [0, 1] maps to a model's tendon and actuator: the values when closed and when open.
+
+    Both models are open at joint position 0.
+    """
+
+    tendon: str
+    actuator: str
+    length: tuple[float, float]
+    control: tuple[float, float]
+
+
+GRIPPERS = {
+    "primitive": Gripper("gripper", "gripper", length=(0.085, 0.0), control=(0.085, 0.0)),
+    "menagerie": Gripper("split", "gripper", length=(0.85, 0.0), control=(255.0, 0.0)),
+}
+
+
+def robot_spec(robot: str = "primitive") -> mujoco.MjSpec:
+    """The arm on a base at the origin, gravity compensated within its torque limits.
+
+    Raises:
+        ValueError: `robot` is not one of `ROBOTS`.
+        ImportError: `menagerie` without the package `mujoco-menagerie`.
+    """
+    if robot not in ROBOTS:
+        raise ValueError(f"robot must be one of {ROBOTS}, got {robot!r}")
+    spec = mujoco.MjSpec.from_file(str(_PRIMITIVE_XML)) if robot == "primitive" else _menagerie_spec()
+    for body in spec.bodies:
+        body.gravcomp = 1.0
+    for name in ARM_JOINTS:
+        # Compensation is the motors' work, so that it counts against their torque limit.
+        spec.joint(name).actgravcomp = True
+    return spec
+
+
+def _menagerie_spec() -> mujoco.MjSpec:
+    try:
+        import mujoco_menagerie
+    except ImportError as error:
+        raise ImportError(
+            "robot='menagerie' needs mujoco-menagerie: pip install 'lerobot_policy_hdp[menagerie]'"
+        ) from error
+    spec = mujoco_menagerie.get("ufactory_xarm7").spec("xarm7")
+    spec.body("link_base").pos = (0, 0, 0)
+    for name in ARM_JOINTS:
+        joint, actuator = spec.joint(name), spec.actuator(name.replace("joint", "act"))
+        joint.frictionloss = 0.0
+        joint.actfrcrange = actuator.forcerange
+    for geom in spec.geoms:
+        geom.contype, geom.conaffinity = ROBOT_CONTYPE, 0
+
+    hand = spec.body("xarm_gripper_base_link")
+    hand.add_site(name=TCP_SITE, pos=(0, 0, _MENAGERIE_TCP_DEPTH))
+    camera = hand.add_camera(name=WRIST_CAMERA, pos=(0.06, 0, 0.08), fovy=85)
+    camera.alt.xyaxes = (0, -1, 0, -0.94, 0, -0.34)
+    return spec
