@@ -139,9 +139,7 @@ class BlockSorting2DEnv(gym.Env):
         if options and "order" in options:
             order = np.asarray(options["order"])
             if sorted(order) != list(range(self.n_blocks)):
-                raise ValueError(
-                    f"order must be a permutation of 0..{self.n_blocks - 1}, got {order.tolist()}"
-                )
+                raise ValueError(f"order must be a permutation of 0..{self.n_blocks - 1}, got {order.tolist()}")
         offsets = self.np_random.uniform(-START_OFFSET, START_OFFSET, size=(self.n_blocks, 2))
         self.blocks = np.empty((self.n_blocks, 2))
         self.blocks[order] = self.slots[: self.n_blocks] + offsets
@@ -236,9 +234,7 @@ def draw_scene(env: BlockSorting2DEnv) -> np.ndarray:
     image = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
 
     def box(centre: np.ndarray, half_size, colour, thickness: int) -> None:
-        corner, opposite = (
-            env.world_to_pixels(np.stack([centre - half_size, centre + half_size])).round().astype(int)
-        )
+        corner, opposite = env.world_to_pixels(np.stack([centre - half_size, centre + half_size])).round().astype(int)
         cv2.rectangle(image, corner.tolist(), opposite.tolist(), colour, thickness, cv2.LINE_AA)
 
     def text(centre: np.ndarray, words: str, scale: float, colour) -> None:

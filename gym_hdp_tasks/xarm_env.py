@@ -9,7 +9,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from .scene import FRONT_CAMERA, FRONT_CAMERA_FOVY, furnish
+from .scene import BLOCK_HALF_SIZE, FRONT_CAMERA, FRONT_CAMERA_FOVY, furnish
 from .task import PlanningTask
 from .waypoint_motion import WaypointMotion
 from .xarm7 import ARM_JOINTS, GRIPPERS, ROBOT_CONTYPE, TCP_SITE, WRIST_CAMERA, robot_spec
@@ -22,6 +22,8 @@ would scrape the table."""
 HOME = np.array([0.36, 0.0, 0.22])
 """Where the tool starts, give or take HOME_OFFSET along each axis."""
 HOME_OFFSET = 0.03
+REST_TOLERANCE = 0.005
+"""A block whose centre is within this of BLOCK_HALF_SIZE above the table lies flat on it."""
 
 OBS_TYPES = ("state", "pixels", "pixels_state")
 CAMERAS = (FRONT_CAMERA, WRIST_CAMERA)
@@ -220,6 +222,11 @@ class XArmEnv(gym.Env):
         pairs = self.data.contact.geom
         of_block = (pairs == self.model.geom(name).id).any(axis=1)
         return bool((self.model.geom_contype[pairs[of_block]] == ROBOT_CONTYPE).any())
+
+    def lies_on_table(self, name: str) -> bool:
+        """Whether a block lies flat on the table and the robot has let go of it."""
+        height = self.data.body(name).xpos[2]
+        return abs(height - BLOCK_HALF_SIZE) <= REST_TOLERANCE and not self.touched_by_robot(name)
 
     def world_to_pixels(self, points: np.ndarray) -> np.ndarray:
         """Pixel coordinates of points in the rendered image: (..., 3 or more) metres -> (..., 2) pixels."""

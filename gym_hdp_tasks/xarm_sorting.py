@@ -19,8 +19,6 @@ SLOT_CENTRES = np.array([(0.42, y) for y in (0.195, 0.065, -0.065, -0.195)])
 SLOT_HALF_SIZE = 0.05
 START_OFFSET = 0.02
 """A block starts at most this far from its slot's centre, along x and along y."""
-REST_TOLERANCE = 0.005
-"""A block whose centre is within this of BLOCK_HALF_SIZE above the table lies flat on it."""
 
 MOST_MOVES = 6
 TOKENS_PER_MOVE = 6
@@ -90,9 +88,6 @@ class XArmSortingEnv(XArmEnv):
 
     def score(self) -> float:
         """Fraction of blocks that lie on the table in their own slot, let go by the gripper."""
-        positions = self.object_poses()[:, :3]
-        own_slot = SLOT_CENTRES[: len(BLOCKS)]
-        in_slot = np.abs(positions[:, :2] - own_slot).max(axis=1) <= SLOT_HALF_SIZE
-        on_table = np.abs(positions[:, 2] - BLOCK_HALF_SIZE) <= REST_TOLERANCE
-        let_go = np.array([not self.touched_by_robot(name) for name in BLOCKS])
-        return float((in_slot & on_table & let_go).mean())
+        distances = np.abs(self.object_poses()[:, :2] - SLOT_CENTRES[: len(BLOCKS)]).max(axis=1)
+        on_table = np.array([self.lies_on_table(name) for name in BLOCKS])
+        return float((on_table & (distances <= SLOT_HALF_SIZE)).mean())

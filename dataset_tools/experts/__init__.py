@@ -3,10 +3,12 @@
 from dataset_tools.demonstration import Expert
 
 from .block_sorting_2d import sort_blocks_2d
+from .xarm_arrange_blocks import arrange_blocks
 from .xarm_sorting import sort_blocks
 
 EXPERTS: dict[str, Expert] = {
     "hdp/BlockSorting2D-v0": sort_blocks_2d,
     "hdp/XArmSorting-v0": sort_blocks,
+    "hdp/XArmArrangeBlocks-v0": arrange_blocks,
 }
 """Gymnasium id to the expert that solves it."""
