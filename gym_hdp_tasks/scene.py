@@ -15,14 +15,16 @@ GREY = (0.55, 0.55, 0.57)
 
 _TIMESTEP = 1 / 300
 """In seconds. At 1/250 the servos are close to trembling; control periods of 1 and 1/3 s are whole multiples."""
-_FRONT_CAMERA_POS, _FRONT_CAMERA_TARGET = np.array([1.10, 0.0, 0.62]), np.array([0.36, 0.0, 0.07])
 
-
-def furnish(spec: mujoco.MjSpec, image_height: int, image_width: int) -> None:
-    """Put the table under the robot, and light and a camera before it.
+def furnish(
+    spec: mujoco.MjSpec, camera_position: np.ndarray, camera_target: np.ndarray, image_height: int, image_width: int
+) -> None:
+    """Put the table under the robot, and light and the front camera before it.
 
     Args:
         spec: the robot.
+        camera_position: (3,) of the front camera.
+        camera_target: (3,) what it looks at.
         image_height: of the largest image that will be rendered, in pixels.
         image_width: likewise.
     """
@@ -61,9 +63,11 @@ def furnish(spec: mujoco.MjSpec, image_height: int, image_width: int) -> None:
         friction=(0.6, 0.005, 0.0001),
     )
     world.add_camera(
-        name=FRONT_CAMERA, pos=_FRONT_CAMERA_POS, quat=_look_at(_FRONT_CAMERA_POS, _FRONT_CAMERA_TARGET),
+        name=FRONT_CAMERA,
+        pos=camera_position,
+        quat=_look_at(camera_position, camera_target),
         fovy=FRONT_CAMERA_FOVY,
-    )  # fmt: skip
+    )
 
 
 def add_block(spec: mujoco.MjSpec, name: str, colour: tuple[float, float, float]) -> None:
@@ -82,7 +86,9 @@ def add_block(spec: mujoco.MjSpec, name: str, colour: tuple[float, float, float]
     )
 
 
-def add_slot(spec: mujoco.MjSpec, centre, half_size: float, colour: tuple[float, float, float]) -> None:
+def add_slot(
+    spec: mujoco.MjSpec, centre: np.ndarray, half_size: float, colour: tuple[float, float, float]
+) -> None:
     """A square painted on the table: a frame around a lighter field, which nothing collides with."""
     tint = 1 - 0.35 * (1 - np.array(colour))
     for size, height, rgb in ((half_size, 0.0004, colour), (half_size - 0.004, 0.0008, tint)):

@@ -65,6 +65,10 @@ class XArmEnv(gym.Env):
 
     object_names: tuple[str, ...]
     """The task's free bodies, in the order of `environment_state`."""
+    camera_position = np.array([0.98, 0.0, 0.52])
+    """Where the camera `front` is."""
+    camera_target = np.array([0.37, 0.0, 0.05])
+    """What it looks at."""
 
     def __init__(
         self,
@@ -93,7 +97,13 @@ class XArmEnv(gym.Env):
 
         spec = robot_spec(robot)
         robot_model = spec.compile()
-        furnish(spec, max(camera_height, RENDER_HEIGHT), max(camera_width, RENDER_WIDTH))
+        furnish(
+            spec,
+            self.camera_position,
+            self.camera_target,
+            image_height=max(camera_height, RENDER_HEIGHT),
+            image_width=max(camera_width, RENDER_WIDTH),
+        )
         self.add_objects(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
