@@ -16,6 +16,7 @@ GREY = (0.55, 0.55, 0.57)
 _TIMESTEP = 1 / 300
 """In seconds. At 1/250 the servos are close to trembling; control periods of 1 and 1/3 s are whole multiples."""
 
+
 def furnish(
     spec: mujoco.MjSpec, camera_position: np.ndarray, camera_target: np.ndarray, image_height: int, image_width: int
 ) -> None:
@@ -86,9 +87,7 @@ def add_block(spec: mujoco.MjSpec, name: str, colour: tuple[float, float, float]
     )
 
 
-def add_slot(
-    spec: mujoco.MjSpec, centre: np.ndarray, half_size: float, colour: tuple[float, float, float]
-) -> None:
+def add_slot(spec: mujoco.MjSpec, centre: np.ndarray, half_size: float, colour: tuple[float, float, float]) -> None:
     """A square painted on the table: a frame around a lighter field, which nothing collides with."""
     tint = 1 - 0.35 * (1 - np.array(colour))
     for size, height, rgb in ((half_size, 0.0004, colour), (half_size - 0.004, 0.0008, tint)):

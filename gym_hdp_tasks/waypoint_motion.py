@@ -108,9 +108,7 @@ class WaypointMotion:
         joints = start_joints + slope * s + curvature * s**2
         speeds = (slope + 2 * curvature * s) * rate
         openings = start[3] + (waypoint[3] - start[3]) * self._progress[:, 0]
-        accelerations = (
-            slope + 2 * curvature * s
-        ) * reached * self._progress_acceleration + 2 * curvature * rate**2
+        accelerations = (slope + 2 * curvature * s) * reached * self._progress_acceleration + 2 * curvature * rate**2
         controls = self._controls(joints + self._delay * speeds + self._lag * accelerations, openings)
 
         self._joints = joints[-1]
@@ -129,10 +127,7 @@ class WaypointMotion:
         self._tool.set_target(mink.SE3.from_rotation_and_translation(_GRIPPER_DOWN, position))
         for _ in range(_MAX_ITERATIONS):
             error = self._tool.compute_error(self._configuration)
-            if (
-                np.linalg.norm(error[:3]) < _POSITION_TOLERANCE
-                and np.linalg.norm(error[3:]) < _ROTATION_TOLERANCE
-            ):
+            if np.linalg.norm(error[:3]) < _POSITION_TOLERANCE and np.linalg.norm(error[3:]) < _ROTATION_TOLERANCE:
                 break
             velocity = mink.solve_ik(
                 self._configuration,

@@ -23,8 +23,17 @@ TCP_SITE = "tcp"
 WRIST_CAMERA = "wrist"
 
 _PRIMITIVE_XML = Path(__file__).parent / "assets" / "xarm7.xml"
+_ARMATURE = (0.5, 0.5, 0.3, 0.3, 0.3, 0.2, 0.2)
+"""Inertia of the joints' motors and gears in kg m^2; `assets/xarm7.xml` says why."""
+
+# Menagerie's fingers are convex hulls of their meshes. A box on each takes the grip, 0.5 mm proud of the mesh.
+_MENAGERIE_PAD_OFFSET = 0.0237
+"""In metres, from a finger's frame inwards to the middle of the pad."""
 _MENAGERIE_TCP_DEPTH = 0.155
-"""In metres from the gripper's base to between its pads; Menagerie's own `link_tcp` (0.172) lies beyond their ends."""
+"""In metres, from the gripper's base to between the pads when they hold a block; Menagerie's own `link_tcp` (0.172)
+lies beyond their ends."""
+_MENAGERIE_GRIPPER_FORCE = 1.2
+"""On the tendon: about 10 N at a pad. The full 50 squeezes a light block out sideways."""
 
 
 @dataclass(frozen=True)
@@ -73,15 +82,32 @@ def _menagerie_spec() -> mujoco.MjSpec:
         ) from error
     spec = mujoco_menagerie.get("ufactory_xarm7").spec("xarm7")
     spec.body("link_base").pos = (0, 0, 0)
-    for name in ARM_JOINTS:
+    for name, armature in zip(ARM_JOINTS, _ARMATURE, strict=True):
         joint, actuator = spec.joint(name), spec.actuator(name.replace("joint", "act"))
-        joint.frictionloss = 0.0
+        joint.armature = armature
         joint.actfrcrange = actuator.forcerange
+    for joint in spec.joints:
+        joint.frictionloss = 0.0
+    spec.actuator("gripper").forcerange = (-_MENAGERIE_GRIPPER_FORCE, _MENAGERIE_GRIPPER_FORCE)
     for geom in spec.geoms:
         geom.contype, geom.conaffinity = ROBOT_CONTYPE, 0
+    for finger, inward in (("left_finger", -1), ("right_finger", 1)):
+        spec.body(finger).add_geom(
+            name=finger.replace("finger", "pad"),
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(0.014, 0.003, 0.017),
+            pos=(0, inward * _MENAGERIE_PAD_OFFSET, 0.042),
+            rgba=(0.25, 0.25, 0.27, 1),
+            contype=ROBOT_CONTYPE,
+            conaffinity=0,
+            priority=1,
+            friction=(1.5, 0.02, 0.0001),
+            solref=(0.007, 1),
+            solimp=(0.98, 0.99, 0.001, 0.5, 2),
+            mass=0,
+        )
 
     hand = spec.body("xarm_gripper_base_link")
     hand.add_site(name=TCP_SITE, pos=(0, 0, _MENAGERIE_TCP_DEPTH))
-    camera = hand.add_camera(name=WRIST_CAMERA, pos=(0.06, 0, 0.08), fovy=85)
-    camera.alt.xyaxes = (0, -1, 0, -0.94, 0, -0.34)
+    hand.add_camera(name=WRIST_CAMERA, pos=(0.06, 0, 0.08), quat=(0.1221, -0.6965, 0.6965, -0.1221), fovy=85)
     return spec

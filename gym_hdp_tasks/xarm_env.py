@@ -109,12 +109,8 @@ class XArmEnv(gym.Env):
         self.data = mujoco.MjData(self.model)
         self._gripper = GRIPPERS[robot]
         self._arm_qpos = np.array([self.model.joint(name).qposadr[0] for name in ARM_JOINTS])
-        self._object_qpos = np.array(
-            [self.model.joint(name).qposadr[0] + np.arange(7) for name in self.object_names]
-        )
-        self._motion = WaypointMotion(
-            robot_model, self._gripper, 1 / planning_task.fps, self.model.opt.timestep
-        )
+        self._object_qpos = np.array([self.model.joint(name).qposadr[0] + np.arange(7) for name in self.object_names])
+        self._motion = WaypointMotion(robot_model, self._gripper, 1 / planning_task.fps, self.model.opt.timestep)
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
 
         self.action_space = gym.spaces.Box(
