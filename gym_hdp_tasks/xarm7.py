@@ -25,6 +25,8 @@ WRIST_CAMERA = "wrist"
 _PRIMITIVE_XML = Path(__file__).parent / "assets" / "xarm7.xml"
 _ARMATURE = (0.5, 0.5, 0.3, 0.3, 0.3, 0.2, 0.2)
 """Inertia of the joints' motors and gears in kg m^2; `assets/xarm7.xml` says why."""
+_STIFFNESS_SCALE, _DAMPING_SCALE = 2.0, 0.5
+"""What the servos' gains are multiplied by, as in `assets/xarm7.xml`, for an arm that settles sooner."""
 
 # Menagerie's fingers are convex hulls of their meshes. A box on each takes the grip, 0.5 mm proud of the mesh.
 _MENAGERIE_PAD_OFFSET = 0.0237
@@ -86,6 +88,10 @@ def _menagerie_spec() -> mujoco.MjSpec:
         joint, actuator = spec.joint(name), spec.actuator(name.replace("joint", "act"))
         joint.armature = armature
         joint.actfrcrange = actuator.forcerange
+        gain, bias = actuator.gainprm.copy(), actuator.biasprm.copy()
+        gain[0] *= _STIFFNESS_SCALE
+        bias[1:3] *= _STIFFNESS_SCALE, _DAMPING_SCALE
+        actuator.gainprm, actuator.biasprm = gain, bias
     for joint in spec.joints:
         joint.frictionloss = 0.0
     spec.actuator("gripper").forcerange = (-_MENAGERIE_GRIPPER_FORCE, _MENAGERIE_GRIPPER_FORCE)
