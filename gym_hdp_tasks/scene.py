@@ -13,6 +13,7 @@ FRONT_CAMERA_FOVY = 42.0
 RED, GREEN, BLUE = (0.84, 0.24, 0.22), (0.18, 0.62, 0.36), (0.20, 0.46, 0.82)
 GREY = (0.55, 0.55, 0.57)
 
+_MATTE = "matte"
 _TIMESTEP = 1 / 300
 """In seconds. At 1/250 the servos are close to trembling; control periods of 1 and 1/3 s are whole multiples."""
 
@@ -37,8 +38,8 @@ def furnish(
     spec.visual.global_.offheight = image_height
     spec.visual.global_.offwidth = image_width
     spec.visual.quality.shadowsize = 2048
-    spec.visual.headlight.ambient = (0.35, 0.35, 0.35)
-    spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
+    spec.visual.headlight.ambient = (0.30, 0.30, 0.30)
+    spec.visual.headlight.diffuse = (0.25, 0.25, 0.25)
     spec.visual.headlight.specular = (0.1, 0.1, 0.1)
 
     spec.add_texture(
@@ -50,15 +51,17 @@ def furnish(
         width=128,
         height=768,
     )
+    spec.add_material(name=_MATTE, specular=0, shininess=0)
     world = spec.worldbody
-    world.add_light(pos=(0.9, 0.3, 1.8), dir=(-0.3, -0.15, -1), diffuse=(0.35, 0.35, 0.35), castshadow=True)
-    world.add_light(pos=(0.6, -0.8, 1.5), dir=(-0.1, 0.5, -1), diffuse=(0.3, 0.3, 0.3), castshadow=False)
+    world.add_light(pos=(0.9, 0.3, 1.8), dir=(-0.3, -0.15, -1), diffuse=(0.45, 0.45, 0.45), castshadow=True)
+    world.add_light(pos=(0.6, -0.8, 1.5), dir=(-0.1, 0.5, -1), diffuse=(0.35, 0.35, 0.35), castshadow=False)
     # The plane is drawn as a table top and collides without end: nothing can fall off.
     world.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=(1.2, 1.2, 0.1),
-        rgba=(0.83, 0.80, 0.75, 1),
+        material=_MATTE,
+        rgba=(0.80, 0.77, 0.72, 1),
         contype=1,
         conaffinity=3,
         friction=(0.6, 0.005, 0.0001),
@@ -89,12 +92,13 @@ def add_block(spec: mujoco.MjSpec, name: str, colour: tuple[float, float, float]
 
 def add_slot(spec: mujoco.MjSpec, centre: np.ndarray, half_size: float, colour: tuple[float, float, float]) -> None:
     """A square painted on the table: a frame around a lighter field, which nothing collides with."""
-    tint = 1 - 0.35 * (1 - np.array(colour))
+    tint = 1 - 0.45 * (1 - np.array(colour))
     for size, height, rgb in ((half_size, 0.0004, colour), (half_size - 0.004, 0.0008, tint)):
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=(size, size, height / 2),
             pos=(*centre, height / 2),
+            material=_MATTE,
             rgba=(*rgb, 1),
             contype=0,
             conaffinity=0,
