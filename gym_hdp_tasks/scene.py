@@ -15,7 +15,7 @@ GREY = (0.55, 0.55, 0.57)
 
 _MATTE = "matte"
 _TIMESTEP = 1 / 300
-"""In seconds. At 1/250 the servos are close to trembling; control periods of 1 and 1/3 s are whole multiples."""
+"""In seconds: control periods of 1 s and 1/3 s are whole multiples."""
 
 
 def furnish(
@@ -32,7 +32,7 @@ def furnish(
     """
     spec.option.timestep = _TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # Elliptic cones and a stiff friction keep a squeezed block from creeping out of the gripper.
+    # What MuJoCo's documentation advises against slip in a grasp.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
     spec.visual.global_.offheight = image_height

@@ -26,9 +26,9 @@ _GRIPPER_DOWN = mink.SO3.from_matrix(np.diag([-1.0, 1.0, -1.0]))
 class WaypointMotion:
     """Turns waypoints into actuator controls, one control period at a time.
 
-    Between two waypoints the tool moves straight (a parabola in joint space, through the inverse kinematics of the
-    half-way point, keeps within 2 mm of the line over 20 cm) and rests at each end. Where that would exceed
-    the joints' speed limit, the arm stops short on the line.
+    Between two waypoints the tool moves straight and rests at each end: a parabola in joint space, through the
+    inverse kinematics of the half-way point, keeps within 3 mm of the line over 20 cm. Where that would exceed the
+    joints' speed limit, the arm stops short on the line.
 
     Args:
         robot_model: the robot alone, for kinematics.
@@ -45,16 +45,15 @@ class WaypointMotion:
         self._gripper_actuator = robot_model.actuator(gripper.actuator).id
         self._n_actuators = robot_model.nu
 
-        home = robot_model.qpos0.copy()
-        home[self._arm_qpos] = HOME_JOINTS
-        self._home = home
+        self._home = robot_model.qpos0.copy()
+        self._home[self._arm_qpos] = HOME_JOINTS
 
         # A servo with gain kp and damping kv follows a constant speed with this delay, in s, and a constant
         # acceleration with this lag, in s^2; commanding the position that far ahead cancels both.
         dofs = [robot_model.joint(name).dofadr[0] for name in ARM_JOINTS]
         kp, kv = robot_model.actuator_gainprm[actuators, 0], -robot_model.actuator_biasprm[actuators, 2]
         self._delay = (kv + robot_model.dof_damping[dofs]) / kp
-        self._lag = _joint_inertias(robot_model, home)[dofs] / kp
+        self._lag = _joint_inertias(robot_model, self._home)[dofs] / kp
 
         n_controls = round(control_period / timestep)
         self._move_time = control_period - SETTLE_TIME
@@ -106,9 +105,10 @@ class WaypointMotion:
 
         s, rate = reached * self._progress, reached * self._progress_rate
         joints = start_joints + slope * s + curvature * s**2
-        speeds = (slope + 2 * curvature * s) * rate
+        direction = slope + 2 * curvature * s
+        speeds = direction * rate
+        accelerations = direction * reached * self._progress_acceleration + 2 * curvature * rate**2
         openings = start[3] + (waypoint[3] - start[3]) * self._progress[:, 0]
-        accelerations = (slope + 2 * curvature * s) * reached * self._progress_acceleration + 2 * curvature * rate**2
         controls = self._controls(joints + self._delay * speeds + self._lag * accelerations, openings)
 
         self._joints = joints[-1]

@@ -1,7 +1,7 @@
 """The xArm7 with a parallel gripper, as an `MjSpec` to put a scene around.
 
-Two models answer to the same names: joints `joint1` ... `joint7`, site `tcp` midway between the pads, a tendon and an
-actuator that open the gripper, and geoms whose names end in `_pad`.
+Two models answer to the same names: joints `joint1` ... `joint7` and their actuators `act1` ... `act7`, the site `tcp`
+midway between the pads, the camera `wrist`, and the geoms `left_pad` and `right_pad`. `GRIPPERS` says how each opens.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,6 @@ _ARMATURE = (0.5, 0.5, 0.3, 0.3, 0.3, 0.2, 0.2)
 """Inertia of the joints' motors and gears in kg m^2; `assets/xarm7.xml` says why."""
 _STIFFNESS_SCALE, _DAMPING_SCALE = 2.0, 0.5
 """What the servos' gains are multiplied by, as in `assets/xarm7.xml`, for an arm that settles sooner."""
-
-# Menagerie's fingers are convex hulls of their meshes. A box on each takes the grip, 0.5 mm proud of the mesh.
 _MENAGERIE_PAD_OFFSET = 0.0237
 """In metres, from a finger's frame inwards to the middle of the pad."""
 _MENAGERIE_TCP_DEPTH = 0.155
@@ -97,6 +95,16 @@ def _menagerie_spec() -> mujoco.MjSpec:
     spec.actuator("gripper").forcerange = (-_MENAGERIE_GRIPPER_FORCE, _MENAGERIE_GRIPPER_FORCE)
     for geom in spec.geoms:
         geom.contype, geom.conaffinity = ROBOT_CONTYPE, 0
+    _add_menagerie_pads(spec)
+
+    hand = spec.body("xarm_gripper_base_link")
+    hand.add_site(name=TCP_SITE, pos=(0, 0, _MENAGERIE_TCP_DEPTH))
+    hand.add_camera(name=WRIST_CAMERA, pos=(0.06, 0, 0.08), quat=(0.1221, -0.6965, 0.6965, -0.1221), fovy=85)
+    return spec
+
+
+def _add_menagerie_pads(spec: mujoco.MjSpec) -> None:
+    """Menagerie's fingers collide as convex hulls of their meshes; a box on each, 0.5 mm proud, takes the grip."""
     for finger, inward in (("left_finger", -1), ("right_finger", 1)):
         spec.body(finger).add_geom(
             name=finger.replace("finger", "pad"),
@@ -112,8 +120,3 @@ def _menagerie_spec() -> mujoco.MjSpec:
             solimp=(0.98, 0.99, 0.001, 0.5, 2),
             mass=0,
         )
-
-    hand = spec.body("xarm_gripper_base_link")
-    hand.add_site(name=TCP_SITE, pos=(0, 0, _MENAGERIE_TCP_DEPTH))
-    hand.add_camera(name=WRIST_CAMERA, pos=(0.06, 0, 0.08), quat=(0.1221, -0.6965, 0.6965, -0.1221), fovy=85)
-    return spec

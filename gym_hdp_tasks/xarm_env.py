@@ -3,6 +3,7 @@
 A task adds its objects, says where they start, and scores where they end.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -63,6 +64,7 @@ class XArmEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (gymnasium's own form)
 
+    action_space: gym.spaces.Box
     object_names: tuple[str, ...]
     """The task's free bodies, in the order of `environment_state`."""
     camera_position = np.array([0.98, 0.0, 0.52])
@@ -184,10 +186,10 @@ class XArmEnv(gym.Env):
             renderer.close()
         self._renderers.clear()
 
-    # What experts, tests and open-loop scoring use besides.
+    # What tasks, experts and tests use besides.
 
     def controls(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Actuator controls that `step` would apply, one row per physics step; advances the commanded motion.
+        """The actuator controls of one step; the commanded motion then stands at their end, and physics is to follow.
 
         Returns:
             (physics steps, actuators) controls, and whether the action was clipped.
@@ -221,9 +223,9 @@ class XArmEnv(gym.Env):
         """x, y, z in metres and unit quaternion (w, x, y, z) of each object: (n, 7)."""
         return self.data.qpos[self._object_qpos]
 
-    def set_object_pose(self, name: str, position, quaternion=(1.0, 0.0, 0.0, 0.0)) -> None:
-        """Put an object somewhere: x, y, z in metres and unit quaternion (w, x, y, z)."""
-        self.data.joint(name).qpos[:] = (*position, *quaternion)
+    def set_object_pose(self, name: str, position: Sequence[float]) -> None:
+        """Put an object at x, y, z in metres, upright and square to the table."""
+        self.data.joint(name).qpos[:] = (*position, 1, 0, 0, 0)
 
     def touched_by_robot(self, name: str) -> bool:
         """Whether any part of the robot touches a block."""

@@ -75,13 +75,14 @@ class XArmSortingEnv(XArmEnv):
             ValueError: the order is no permutation of the blocks.
         """
         n_blocks = len(BLOCKS)
-        order = np.arange(n_blocks)
-        while np.array_equal(order, np.arange(n_blocks)):
-            order = self.np_random.permutation(n_blocks)
+        sorted_order = list(range(n_blocks))
+        order = sorted_order
+        while order == sorted_order:
+            order = self.np_random.permutation(n_blocks).tolist()
         if "order" in options:
-            order = np.asarray(options["order"])
-            if sorted(order.tolist()) != list(range(n_blocks)):
-                raise ValueError(f"order must be a permutation of 0..{n_blocks - 1}, got {order.tolist()}")
+            order = list(options["order"])
+            if sorted(order) != sorted_order:
+                raise ValueError(f"order must be a permutation of 0..{n_blocks - 1}, got {order}")
         offsets = self.np_random.uniform(-START_OFFSET, START_OFFSET, size=(n_blocks, 2))
         for slot, block in enumerate(order):
             self.set_object_pose(BLOCKS[block], (*(SLOT_CENTRES[slot] + offsets[slot]), BLOCK_HALF_SIZE))

@@ -219,4 +219,7 @@ def test_lerobot_sees_the_features_that_the_config_announces(gym_id, obs_type):
     assert {name for name in batch if "symbolic_plan" not in name} == set(announced)
     assert vector_env.call("_max_episode_steps") == (config.planning_task.horizon,)
     assert len([name for name in announced if "images" in name]) == (0 if obs_type == "state" else len(CAMERAS))
+    for _ in range(2):
+        *_, info = vector_env.step(vector_env.action_space.sample())
+    assert info["score"].shape == (1,)
     vector_env.close()

@@ -31,6 +31,18 @@ def test_the_expert_succeeds(gym_id, robot):
         assert info["is_success"]
 
 
+def test_nothing_but_friction_holds_a_block():
+    env, demonstration = demonstrate("hdp/XArmArrangeBlocks-v0", 0)
+    for pad in ("left_pad", "right_pad"):
+        env.model.geom(pad).friction[:] = 0.01
+    highest = 0.0
+    for action in demonstration.waypoints:
+        env.step(action)
+        highest = max(highest, env.object_poses()[:, 2].max())
+    assert highest < 0.05
+    assert env.score() < 1.0
+
+
 @pytest.mark.parametrize("gym_id", IDS)
 def test_a_demonstration_fits_the_task_and_starts_where_the_tool_is(gym_id):
     for seed in range(10):

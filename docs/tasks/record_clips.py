@@ -31,16 +31,14 @@ def record(gym_id: str) -> list[np.ndarray]:
     demonstration = EXPERTS[gym_id](env, np.random.default_rng(SEED))
     physics_steps_per_capture = round(1 / CAPTURES_PER_SECOND / env.model.opt.timestep)
     frames = []
-    for step in demonstration.steps:
-        start = 0 if step is demonstration.steps[0] else previous.stop
-        previous = step
-        for waypoint in demonstration.waypoints[start : step.stop]:
-            controls, _ = env.controls(waypoint)
-            for number, control in enumerate(controls, start=1):
-                env.data.ctrl[:] = control
-                mujoco.mj_step(env.model, env.data)
-                if number % physics_steps_per_capture == 0:
-                    frames.append(captioned(env.render(), " ".join(step.symbols)))
+    for step, waypoint in enumerate(demonstration.waypoints[: demonstration.steps[-1].stop]):
+        current = next(plan_step for plan_step in demonstration.steps if plan_step.stop > step)
+        controls, _ = env.controls(waypoint)
+        for number, control in enumerate(controls, start=1):
+            env.data.ctrl[:] = control
+            mujoco.mj_step(env.model, env.data)
+            if number % physics_steps_per_capture == 0:
+                frames.append(captioned(env.render(), " ".join(current.symbols)))
     env.close()
     return frames
 
