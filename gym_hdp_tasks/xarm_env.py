@@ -179,7 +179,7 @@ class XArmEnv(gym.Env):
 
     def render(self) -> np.ndarray:
         """The scene from the camera `front`: (480, 640, 3) uint8."""
-        return self._image(FRONT_CAMERA, RENDER_HEIGHT, RENDER_WIDTH)
+        return self._image(FRONT_CAMERA, RENDER_HEIGHT, RENDER_WIDTH, shadows=True)
 
     def close(self) -> None:
         for renderer in self._renderers.values():
@@ -253,11 +253,12 @@ class XArmEnv(gym.Env):
             axis=-1,
         )
 
-    def _image(self, camera: str, height: int, width: int) -> np.ndarray:
+    def _image(self, camera: str, height: int, width: int, shadows: bool) -> np.ndarray:
         if (height, width) not in self._renderers:
             self._renderers[height, width] = mujoco.Renderer(self.model, height, width)
         renderer = self._renderers[height, width]
         renderer.update_scene(self.data, camera)
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         return renderer.render()
 
     def _observation_spaces(self) -> dict[str, gym.Space]:
@@ -280,7 +281,10 @@ class XArmEnv(gym.Env):
             observation["agent_pos"] = np.array(agent_pos, dtype=np.float32)
             observation["environment_state"] = self.object_poses().flatten().astype(np.float32)
         if self.obs_type != "state":
-            observation["pixels"] = {name: self._image(name, *self.camera_size) for name in self.camera_names}
+            # Without a GPU, shadows would take most of the time of an episode.
+            observation["pixels"] = {
+                name: self._image(name, *self.camera_size, shadows=False) for name in self.camera_names
+            }
         return observation
 
     def _info(self, clipped: bool) -> dict[str, Any]:
