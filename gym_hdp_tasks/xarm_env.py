@@ -205,6 +205,12 @@ class XArmEnv(gym.Env):
         controls, reached = self._motion.move_to(np.clip(action, low, high).astype(np.float64))
         return controls, outside or not reached
 
+    def end_episode(self, clipped: bool) -> dict[str, Any]:
+        """The last step's `info`, when the physics of an episode was run elsewhere and `data` holds its final state."""
+        self.update_poses()
+        self.elapsed_steps = self.planning_task.horizon
+        return self._info(clipped)
+
     def update_poses(self) -> None:
         """Bring body poses and contacts up to date with the joint positions, which a physics step leaves behind."""
         mujoco.mj_fwdPosition(self.model, self.data)

@@ -38,9 +38,9 @@ def stepped_outcomes(plans):
     return outcomes
 
 
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_outcomes_are_those_of_stepping_the_environment(plans, num_workers):
-    outcomes = execute_plans(GYM_ID, SEEDS, plans, num_workers)
+@pytest.mark.parametrize("num_threads", [1, 3])
+def test_outcomes_are_those_of_stepping_the_environment(plans, num_threads):
+    outcomes = execute_plans(GYM_ID, SEEDS, plans, num_threads)
     assert outcomes == stepped_outcomes(plans)
     assert outcomes[0]["is_success"]
     assert not all(outcome["is_success"] for outcome in outcomes)
@@ -60,6 +60,11 @@ def test_plans_that_do_not_fit_the_task_are_refused(plans, change, message):
         execute_plans(GYM_ID, SEEDS, change(plans))
 
 
+def test_a_task_without_physics_is_refused():
+    with pytest.raises(ValueError, match="no X-Arm task"):
+        execute_plans("hdp/BlockSorting2D-v0", [0], np.zeros((1, 109, 3)))
+
+
 def test_the_command_prints_scores_as_json_and_refuses_a_broken_file(plans, tmp_path):
     def run(path):
         command = [
@@ -68,7 +73,7 @@ def test_the_command_prints_scores_as_json_and_refuses_a_broken_file(plans, tmp_
             "gym_hdp_tasks.open_loop",
             "XArmArrangeBlocks-v0",
             str(path),
-            "--num_workers=1",
+            "--num_threads=1",
         ]
         return subprocess.run(command, capture_output=True, text=True, check=False)
 
