@@ -37,6 +37,15 @@ class TimedPhysics:
         self.steps += 1
 
 
+def expert_generator(seed: int) -> np.random.Generator:
+    """The expert's own random numbers.
+
+    Seeded with the bare seed they would be those that the environment's reset drew, and the choices would follow from
+    the start.
+    """
+    return np.random.default_rng([seed, 1])
+
+
 def measure(gym_id: str, num_episodes: int, robot: str) -> dict:
     """Let the expert demonstrate the seeds 0, 1, ... and count."""
     env = gym.make(gym_id, robot=robot, disable_env_checker=True)
@@ -45,7 +54,7 @@ def measure(gym_id: str, num_episodes: int, robot: str) -> dict:
     start = time.perf_counter()
     for seed in range(num_episodes):
         env.reset(seed=seed)
-        demonstration = EXPERTS[gym_id](env, np.random.default_rng(seed))
+        demonstration = EXPERTS[gym_id](env, expert_generator(seed))
         for action in demonstration.waypoints:
             _, score, _, _, info = env.step(action)
             clipped += info["action_clipped"]

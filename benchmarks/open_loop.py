@@ -34,7 +34,7 @@ def expert_plans(gym_id: str, num_plans: int) -> np.ndarray:
     plans = []
     for seed in range(num_plans):
         env.reset(seed=seed)
-        plans.append(EXPERTS[gym_id](env, np.random.default_rng(seed)).waypoints)
+        plans.append(EXPERTS[gym_id](env, np.random.default_rng([seed, 1])).waypoints)
     return np.stack(plans)
 
 

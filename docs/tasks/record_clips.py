@@ -28,7 +28,7 @@ def record(gym_id: str) -> list[np.ndarray]:
     """Frames (HEIGHT + CAPTION_HEIGHT, WIDTH, 3) of one demonstration, up to the end of its plan."""
     env = gym.make(gym_id, render_mode="rgb_array", disable_env_checker=True).unwrapped
     env.reset(seed=SEED)
-    demonstration = EXPERTS[gym_id](env, np.random.default_rng(SEED))
+    demonstration = EXPERTS[gym_id](env, np.random.default_rng([SEED, 1]))
     physics_steps_per_capture = round(1 / CAPTURES_PER_SECOND / env.model.opt.timestep)
     frames = []
     for step, waypoint in enumerate(demonstration.waypoints[: demonstration.steps[-1].stop]):
