@@ -7,3 +7,7 @@ from .task import PAD, PlanningTask
 __all__ = ["PAD", "PlanningTask"]
 
 gym.register(id="hdp/BlockSorting2D-v0", entry_point="gym_hdp_tasks.block_sorting_2d:BlockSorting2DEnv")
+gym.register(id="hdp/XArmSorting-v0", entry_point="gym_hdp_tasks.xarm_sorting:XArmSortingEnv")
+gym.register(id="hdp/XArmArrangeBlocks-v0", entry_point="gym_hdp_tasks.xarm_arrange_blocks:XArmArrangeBlocksEnv")
+gym.register(id="hdp/XArmToolUse-v0", entry_point="gym_hdp_tasks.xarm_tool_use:XArmToolUseEnv")
+gym.register(id="hdp/XArmToolUseRedOnTop-v0", entry_point="gym_hdp_tasks.xarm_tool_use:XArmToolUseRedOnTopEnv")

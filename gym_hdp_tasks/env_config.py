@@ -7,12 +7,22 @@ from typing import Any
 from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from .block_sorting_2d import block_sorting_2d_task
 from .task import PlanningTask
+from .xarm_arrange_blocks import xarm_arrange_blocks_task
+from .xarm_env import CAMERAS
+from .xarm_sorting import xarm_sorting_task
+from .xarm_tool_use import xarm_tool_use_red_on_top_task, xarm_tool_use_task
 
-TASKS: dict[str, Callable[..., PlanningTask]] = {"BlockSorting2D-v0": block_sorting_2d_task}
+TASKS: dict[str, Callable[..., PlanningTask]] = {
+    "BlockSorting2D-v0": block_sorting_2d_task,
+    "XArmSorting-v0": xarm_sorting_task,
+    "XArmArrangeBlocks-v0": xarm_arrange_blocks_task,
+    "XArmToolUse-v0": xarm_tool_use_task,
+    "XArmToolUseRedOnTop-v0": xarm_tool_use_red_on_top_task,
+}
 """Task name, as in `--env.task=`, to the function that states the task's facts."""
 
 
@@ -26,11 +36,19 @@ class HDPEnv(EnvConfig):
         n_blocks: number of blocks (BlockSorting2D only).
         waypoints_per_pose: waypoints between two key poses of the expert, which sets the episode's length
             (BlockSorting2D only).
+        robot: `primitive`, or `menagerie` for MuJoCo Menagerie's model (X-Arm tasks only).
+        obs_type: `state`, `pixels` or `pixels_state` (X-Arm tasks only).
+        camera_height: of an observed image, in pixels (X-Arm tasks only).
+        camera_width: likewise.
     """
 
     task: str | None = "BlockSorting2D-v0"
     n_blocks: int = 3
     waypoints_per_pose: int = 3
+    robot: str = "primitive"
+    obs_type: str = "state"
+    camera_height: int = 128
+    camera_width: int = 128
     render_mode: str = "rgb_array"
 
     def __post_init__(self):
@@ -39,12 +57,17 @@ class HDPEnv(EnvConfig):
         except ValueError as error:  # LeRobot's commands show the message of draccus' own error only
             raise ParsingError(str(error)) from error
         self.fps = task.fps
-        self.features = {
-            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(len(task.state_names),)),
-            "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(len(task.environment_state_names),)),
-            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(task.action_names),)),
-        }
-        self.features_map = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE, ACTION: ACTION}
+        self.features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(task.action_names),))}
+        self.features_map = {ACTION: ACTION}
+        if not self._is_xarm or self.obs_type != "pixels":
+            state = PolicyFeature(type=FeatureType.STATE, shape=(len(task.state_names),))
+            poses = PolicyFeature(type=FeatureType.ENV, shape=(len(task.environment_state_names),))
+            self.features |= {"agent_pos": state, "environment_state": poses}
+            self.features_map |= {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+        if self._is_xarm and self.obs_type != "state":
+            image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.camera_height, self.camera_width, 3))
+            self.features |= {f"pixels/{camera}": image for camera in CAMERAS}
+            self.features_map |= {f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in CAMERAS}
 
     @property
     def planning_task(self) -> PlanningTask:
@@ -61,7 +84,11 @@ class HDPEnv(EnvConfig):
     def _task_parameters(self) -> dict[str, Any]:
         if self.task == "BlockSorting2D-v0":
             return {"n_blocks": self.n_blocks, "waypoints_per_pose": self.waypoints_per_pose}
-        return {}
+        return {"robot": self.robot}
+
+    @property
+    def _is_xarm(self) -> bool:
+        return self.task != "BlockSorting2D-v0"
 
     @property
     def package_name(self) -> str:
@@ -73,7 +100,14 @@ class HDPEnv(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        return {"render_mode": self.render_mode, **self._task_parameters}
+        kwargs = {"render_mode": self.render_mode, **self._task_parameters}
+        if self._is_xarm:
+            kwargs |= {
+                "obs_type": self.obs_type,
+                "camera_height": self.camera_height,
+                "camera_width": self.camera_width,
+            }
+        return kwargs
 
     @classmethod
     def default_choice_name(cls) -> str:

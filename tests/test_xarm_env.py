@@ -1,0 +1,225 @@
+"""What all X-Arm environments promise, in real physics."""
+
+import os
+from importlib.util import find_spec
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from lerobot.envs.factory import make_env
+from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+
+import gym_hdp_tasks  # noqa: F401 (registers the tasks)
+from gym_hdp_tasks.env_config import HDPEnv
+from gym_hdp_tasks.xarm_env import CAMERAS, OBS_TYPES, WORKSPACE_HIGH, WORKSPACE_LOW
+
+IDS = (
+    "hdp/XArmSorting-v0",
+    "hdp/XArmArrangeBlocks-v0",
+    "hdp/XArmToolUse-v0",
+    "hdp/XArmToolUseRedOnTop-v0",
+)
+needs_menagerie = pytest.mark.skipif(
+    find_spec("mujoco_menagerie") is None or not os.path.isdir(os.environ.get("MENAGERIE_ROOT", "")),
+    reason="needs mujoco-menagerie, and MENAGERIE_ROOT to name a folder with a copy of its models",
+)
+ROBOTS = ("primitive", pytest.param("menagerie", marks=needs_menagerie))
+
+
+def make(gym_id="hdp/XArmSorting-v0", **kwargs):
+    return gym.make(gym_id, disable_env_checker=True, **kwargs).unwrapped
+
+
+@pytest.mark.parametrize("obs_type", OBS_TYPES)
+@pytest.mark.parametrize("gym_id", IDS)
+def test_gymnasium_finds_nothing_wrong(gym_id, obs_type):
+    env = make(gym_id, obs_type=obs_type, render_mode="rgb_array", camera_height=32, camera_width=48)
+    check_env(env, skip_render_check=obs_type != "state")
+    observation, _ = env.reset(seed=0)
+    assert ("pixels" in observation) == (obs_type != "state")
+    assert ("environment_state" in observation) == (obs_type != "pixels")
+    env.close()
+
+
+@needs_menagerie
+def test_gymnasium_finds_nothing_wrong_with_menagerie_s_robot():
+    check_env(make(robot="menagerie"), skip_render_check=True)
+
+
+@pytest.mark.parametrize("gym_id", IDS)
+def test_an_episode_depends_on_its_seed_alone(gym_id):
+    env, actions = make(gym_id), np.random.default_rng(0)
+    plan = actions.uniform(env.action_space.low, env.action_space.high, size=(5, 4))
+
+    def episode(seed):
+        observations = [env.reset(seed=seed)[0], *(env.step(action)[0] for action in plan)]
+        return np.array([[*o["agent_pos"], *o["environment_state"]] for o in observations])
+
+    first, other, again = episode(1), episode(2), episode(1)
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first[0], other[0])
+
+
+@pytest.mark.parametrize("gym_id", IDS)
+def test_an_episode_lasts_its_horizon_and_pays_at_its_end(gym_id):
+    env = make(gym_id)
+    observation, info = env.reset(seed=0)
+    stay = observation["agent_pos"]
+    horizon = env.planning_task.horizon
+    steps = [env.step(stay) for _ in range(horizon)]
+    assert [truncated for _, _, _, truncated, _ in steps] == [False] * (horizon - 1) + [True]
+    assert all(reward == 0 for _, reward, *_ in steps[:-1])
+    assert not any(terminated or info["is_success"] for _, _, terminated, _, info in steps)
+    assert set(info) == set(steps[-1][-1])
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize(("gym_id", "stride"), [("hdp/XArmSorting-v0", 0.05), ("hdp/XArmArrangeBlocks-v0", 0.2)])
+def test_the_tool_ends_a_waypoint_within_1_mm(gym_id, stride, robot):
+    env, rng = make(gym_id, robot=robot), np.random.default_rng(0)
+    env.reset(seed=0)
+    waypoint = env.tool_position()
+    for _ in range(40):
+        waypoint += rng.uniform(-stride, stride, size=3)
+        waypoint = np.clip(waypoint, WORKSPACE_LOW + [0.05, 0, 0.08], WORKSPACE_HIGH - [0, 0, 0.08])
+        *_, info = env.step(np.array([*waypoint, 1.0]))
+        assert not info["action_clipped"]
+        assert np.linalg.norm(env.tool_position() - waypoint) < 0.001
+
+
+def test_the_tool_moves_straight():
+    env = make("hdp/XArmSorting-v0")
+    env.reset(seed=0)
+    start, end = np.array([0.42, -0.1, 0.12]), np.array([0.42, 0.0, 0.12])
+    for _ in range(10):
+        env.step(np.array([*start, 1.0]))
+    controls, _ = env.controls(np.array([*end, 1.0]))
+    for control in controls:
+        env.data.ctrl[:] = control
+        mujoco.mj_step(env.model, env.data)
+        across = np.delete(env.tool_position() - start, 1)
+        assert np.linalg.norm(across) < 0.003
+
+
+def test_the_whole_workspace_is_reachable():
+    env = make("hdp/XArmArrangeBlocks-v0")
+    for corner in np.stack(np.meshgrid(*zip(WORKSPACE_LOW, WORKSPACE_HIGH, strict=True)), axis=-1).reshape(-1, 3):
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.array([*corner, 1.0]))
+        assert np.linalg.norm(env.tool_position() - corner) < 0.002
+
+
+def test_what_cannot_be_reached_is_clipped_and_reported():
+    env = make()
+    env.reset(seed=0)
+    for _ in range(5):
+        *_, info = env.step(np.array([2.0, 0.0, 0.2, 1.0]))
+        assert info["action_clipped"]
+    assert abs(env.tool_position()[0] - WORKSPACE_HIGH[0]) < 0.002
+
+
+def test_a_waypoint_too_far_for_one_step_is_reported_and_reached_later():
+    env = make()
+    env.reset(seed=0)
+    near_base = np.array([0.23, -0.3, 0.2, 1.0])
+    for _ in range(5):
+        env.step(near_base)
+    across = near_base * [1, -1, 1, 1]
+    clipped = [env.step(across)[-1]["action_clipped"] for _ in range(5)]
+    assert clipped[0]
+    assert not clipped[-1]
+    assert np.linalg.norm(env.tool_position() - across[:3]) < 0.002
+
+
+@pytest.mark.parametrize("action", [np.zeros(3), np.full(4, np.nan), np.array([0.4, 0, 0.1, np.inf]), np.zeros((1, 4))])
+def test_an_action_that_is_no_waypoint_is_refused(action):
+    env = make()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="4 finite numbers"):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"obs_type": "smell"},
+        {"robot": "panda"},
+        {"camera_names": ("side",)},
+        {"camera_height": 0},
+    ],
+)
+def test_an_argument_without_meaning_is_refused(kwargs):
+    with pytest.raises(ValueError, match=next(iter(kwargs)).split("_")[0]):
+        make(**kwargs)
+
+
+def assert_stable(env):
+    assert not env.data.warning.number.any()
+    assert np.isfinite(env.data.qpos).all()
+    assert np.abs(env.object_poses()[:, :3]).max() < 5
+
+
+def test_10_000_random_actions_leave_the_simulation_stable():
+    env, rng = make("hdp/XArmSorting-v0"), np.random.default_rng(0)
+    env.reset(seed=0)
+    for step in range(10_000):
+        env.step(rng.uniform(env.action_space.low, env.action_space.high))
+        if step % 200 == 0:
+            assert_stable(env)
+            env.reset()
+    assert_stable(env)
+
+
+@pytest.mark.parametrize("gym_id", IDS[1:3])
+def test_pressing_blocks_and_tool_into_the_table_leaves_the_simulation_stable(gym_id):
+    env, rng = make(gym_id), np.random.default_rng(0)
+    env.reset(seed=0)
+    for step in range(300):
+        target = env.object_poses()[rng.integers(len(env.object_names)), :3] + rng.normal(0, 0.01, 3)
+        height = rng.choice([-1.0, 0.0, 0.02, 0.05])
+        env.step(np.array([*target[:2], height, rng.integers(2)]))
+        if step % 100 == 0:
+            assert_stable(env)
+            env.reset()
+    assert_stable(env)
+
+
+def test_world_to_pixels_finds_the_blocks_in_the_image():
+    env = make(render_mode="rgb_array")
+    env.reset(seed=3)
+    image = env.render().astype(int)
+    tops = env.object_poses()[:, :3] + [0, 0, 0.02]
+    for (u, v), channel in zip(env.world_to_pixels(tops).round().astype(int), (0, 1, 2), strict=True):
+        pixel = image[v, u]
+        assert pixel.argmax() == channel, f"{pixel} at ({u}, {v})"
+    env.close()
+
+
+def test_cameras_have_the_size_that_was_asked_for():
+    env = make(obs_type="pixels", camera_names=("wrist",), camera_height=500, camera_width=700)
+    observation, _ = env.reset(seed=0)
+    assert {name: image.shape for name, image in observation["pixels"].items()} == {"wrist": (500, 700, 3)}
+    env.close()
+
+
+@pytest.mark.parametrize("obs_type", OBS_TYPES)
+@pytest.mark.parametrize("gym_id", IDS)
+def test_lerobot_sees_the_features_that_the_config_announces(gym_id, obs_type):
+    config = HDPEnv(task=gym_id.removeprefix("hdp/"), obs_type=obs_type, camera_height=32, camera_width=32)
+    vector_env = make_env(config, n_envs=1, use_async_envs=False)["hdp"][0]
+    observation, _ = vector_env.reset(seed=[0])
+    batch = preprocess_observation(observation)
+    announced = env_to_policy_features(config)
+    announced.pop("action")
+    for name, feature in announced.items():
+        assert tuple(batch[name].shape) == (1, *feature.shape), name
+    assert {name for name in batch if "symbolic_plan" not in name} == set(announced)
+    assert vector_env.call("_max_episode_steps") == (config.planning_task.horizon,)
+    assert len([name for name in announced if "images" in name]) == (0 if obs_type == "state" else len(CAMERAS))
+    for _ in range(2):
+        *_, info = vector_env.step(vector_env.action_space.sample())
+    assert info["score"].shape == (1,)
+    vector_env.close()
