@@ -3,7 +3,7 @@
     python -m benchmarks.block_sorting_2d --n_blocks=3
 
 Records the dataset if it is not there, runs `lerobot-train --config_path=configs/block_sorting_2d_<n>_blocks.json` and
-`lerobot-eval`, and writes `benchmarks/results/block_sorting_2d_<n>_blocks.json`.
+`lerobot-eval`, and writes `benchmarks/results/block_sorting_2d_<n>_blocks_<planner>.json`.
 """
 
 import argparse
@@ -76,19 +76,23 @@ def measure(name: str, n_blocks: int, episodes: int, seed: int, *policy_flags: s
     }
 
 
+PLANNERS = {"hdp": (), "diffuser": ("--policy.plan_symbols=false",)}
+"""Name to the flags that make it of the config."""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n_blocks", type=int, default=3)
+    parser.add_argument("--planners", nargs="+", choices=PLANNERS, default=list(PLANNERS))
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1000)
     options = parser.parse_args()
-    result = {"run": describe_run(), "planners": []}
-    for name, flags in {"hdp": (), "diffuser": ("--policy.plan_symbols=false",)}.items():
-        result["planners"].append(measure(name, options.n_blocks, options.episodes, options.seed, *flags))
-        RESULTS.mkdir(exist_ok=True)
-        path = RESULTS / f"block_sorting_2d_{options.n_blocks}_blocks.json"
-        path.write_text(json.dumps(result, indent=2) + "\n")
-        print(json.dumps(result["planners"][-1], indent=2))
+    for name in options.planners:
+        run_facts = describe_run()
+        result = measure(name, options.n_blocks, options.episodes, options.seed, *PLANNERS[name])
+        path = RESULTS / f"block_sorting_2d_{options.n_blocks}_blocks_{name}.json"
+        path.write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
+        print(path.read_text())
 
 
 if __name__ == "__main__":

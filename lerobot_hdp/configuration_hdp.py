@@ -21,6 +21,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "prediction_type": "sample",
         "dropout": 0.0,
         "object_tokens": True,
+        "normalise_condition": True,
+        "observation_weight_std": 0.5,
+        "symbol_loss_weight": 1 / 300,
         "optimizer_lr": 1e-3,
         "scheduler_warmup_steps": 100,
     },
@@ -30,6 +33,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "prediction_type": "epsilon",
         "dropout": 0.3,
         "object_tokens": False,
+        "normalise_condition": False,
+        "observation_weight_std": 0.02,
+        "symbol_loss_weight": 1 / 30,
         "optimizer_lr": 1e-4,
         "scheduler_warmup_steps": 1000,
     },
@@ -61,10 +67,14 @@ class HDPConfig(PreTrainedConfig):
         object_tokens: True makes a condition token of each object in `observation.environment_state` (its components
             are named `object.component` in the dataset) and one of each other observation; False makes one of all.
         observation_token_sizes: how many numbers become each condition token; follows from the dataset.
+        normalise_condition, observation_weight_std: whether the condition tokens are normalised before the transformer
+            attends to them, and the size of the initial weights that make them of the observations. Small weights
+            without normalisation are Diffusion Policy's; with them, fine differences in position are learned late.
         num_train_timesteps: N, steps of the Gaussian process.
         prediction_type: what is predicted of the motion: `epsilon` (the noise), `sample` (the clean motion) or
             `v_prediction`.
-        symbol_loss_weight: lambda, weight of the symbols' loss beside the motion's.
+        symbol_loss_weight: lambda, weight of the symbols' loss beside the motion's. The paper's 1/30 balances it against
+            the error of the noise; that of the clean motion is about ten times smaller.
         ema_power, ema_max_decay: the weights that plan are an exponential moving average with the decay
             min(1 - (1 + update)^-ema_power, ema_max_decay), as in Diffusion Policy. `ema_max_decay` 0 switches it off.
 
@@ -96,9 +106,11 @@ class HDPConfig(PreTrainedConfig):
     dropout: float | None = None
     object_tokens: bool | None = None
     observation_token_sizes: list[int] | None = None
+    normalise_condition: bool | None = None
+    observation_weight_std: float | None = None
     num_train_timesteps: int = 100
     prediction_type: str | None = None
-    symbol_loss_weight: float = 1 / 30
+    symbol_loss_weight: float | None = None
     ema_power: float = 0.75
     ema_max_decay: float = 0.9999
 

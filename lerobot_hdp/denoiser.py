@@ -1,11 +1,13 @@
 """D_theta: one transformer that denoises the motion and the symbols together (paper, Fig. "Architecture")."""
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 
 class Prediction(NamedTuple):
@@ -36,6 +38,25 @@ class SinusoidalEmbedding(nn.Module):
         return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
+class ConditionEncoder(nn.Module):
+    """Two linear layers over each condition token, as in Diffusion Policy: (B, n, width) -> (B, n, width).
+
+    Args:
+        width: size of a token.
+        normalise: add the input to the output and normalise the sum. The decoder does not normalise what it attends to,
+            and weights that start small make an observation so faint that it is learned late.
+    """
+
+    def __init__(self, width: int, normalise: bool):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.norm = nn.LayerNorm(width) if normalise else None
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        encoded = self.layers(tokens)
+        return encoded if self.norm is None else self.norm(tokens + encoded)
+
+
 class Denoiser(nn.Module):
     """(motion prediction, token logits) = D_theta(A_c, A_d, O, k_c, k_d).
 
@@ -51,6 +72,8 @@ class Denoiser(nn.Module):
         vocabulary_size: m.
         symbolic_horizon: H_d; 0 models the motion alone (Diffuser).
         num_layers, num_heads, width, dropout: of the transformer. Dropout acts in attention and feed-forward layers.
+        normalise_condition: make the condition tokens of a size that attention can read from the first step on; False
+            leaves them as small as Diffusion Policy's initialisation makes them.
     """
 
     def __init__(
@@ -65,6 +88,7 @@ class Denoiser(nn.Module):
         num_heads: int,
         width: int,
         dropout: float,
+        normalise_condition: bool,
     ):
         super().__init__()
         self.horizon = horizon
@@ -114,7 +138,8 @@ class Denoiser(nn.Module):
 
         condition = torch.cat([torch.stack(levels, dim=1), observation], dim=1) + self.condition_positions
         memory = self.condition_encoder(condition)
-        hidden = self.decoder(torch.cat(plan, dim=1) + self.positions, memory)
+        with _attention_kernels(memory):
+            hidden = self.decoder(torch.cat(plan, dim=1) + self.positions, memory)
 
         motion_prediction = self.motion_head(hidden[:, : self.horizon])
         logits = self.symbol_head(hidden[:, self.horizon :]) if self.models_symbols else None
@@ -128,6 +153,13 @@ class Denoiser(nn.Module):
             is_matrix = parameter.ndim == 2 and "positions" not in name
             (decay if is_matrix else no_decay).append(parameter)
         return [{"params": decay}, {"params": no_decay, "weight_decay": 0.0}]
+
+
+def _attention_kernels(value: Tensor) -> AbstractContextManager:
+    """PyTorch's choice, but for bfloat16 training on a CPU, where its fused kernel has a slow backward pass."""
+    if value.device.type == "cpu" and value.dtype == torch.bfloat16 and torch.is_grad_enabled():
+        return sdpa_kernel(SDPBackend.MATH)
+    return nullcontext()
 
 
 def _initialise(module: nn.Module) -> None:

@@ -18,13 +18,17 @@ class StateEncoder(nn.Module):
         keys: names of the observations, in the order in which they are concatenated.
         token_sizes: size of each part.
         width: size of a token.
+        weight_std: standard deviation of the initial weights.
     """
 
-    def __init__(self, keys: Iterable[str], token_sizes: Iterable[int], width: int):
+    def __init__(self, keys: Iterable[str], token_sizes: Iterable[int], width: int, weight_std: float):
         super().__init__()
         self.keys = list(keys)
         self.token_sizes = list(token_sizes)
         self.projections = nn.ModuleList(nn.Linear(size, width) for size in self.token_sizes)
+        for projection in self.projections:
+            nn.init.normal_(projection.weight, std=weight_std)
+            nn.init.zeros_(projection.bias)
 
     @property
     def num_tokens(self) -> int:

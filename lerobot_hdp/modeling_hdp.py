@@ -26,7 +26,9 @@ class Planner(nn.Module):
 
     def __init__(self, config: HDPConfig):
         super().__init__()
-        self.encoder = StateEncoder(config.input_features, config.observation_token_sizes, config.width)
+        self.encoder = StateEncoder(
+            config.input_features, config.observation_token_sizes, config.width, config.observation_weight_std
+        )
         self.denoiser = Denoiser(
             action_dim=config.action_feature.shape[0],
             horizon=config.horizon,
@@ -38,6 +40,7 @@ class Planner(nn.Module):
             num_heads=config.num_heads,
             width=config.width,
             dropout=config.dropout,
+            normalise_condition=config.normalise_condition,
         )
 
 

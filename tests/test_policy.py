@@ -22,6 +22,23 @@ def test_sizes_and_vocabulary_come_from_the_dataset(make_planner):
     assert set(policy.config.input_features) == {"observation.state", "observation.environment_state"}
 
 
+def test_each_object_is_a_condition_token_of_its_own(make_planner):
+    assert make_planner()[0].config.observation_token_sizes == [3, 2, 2]
+    assert make_planner(object_tokens=False)[0].config.observation_token_sizes == [7]
+
+
+@pytest.mark.parametrize("object_tokens", [True, False])
+def test_a_plan_depends_on_every_observation(make_planner, batch, object_tokens):
+    policy, preprocessor, _ = make_planner(object_tokens=object_tokens)
+    inputs = observation(preprocessor(batch))
+    encoder = policy.planner.encoder
+    for key, tensor in inputs.items():
+        for component in range(tensor.shape[1]):
+            changed = {**inputs, key: tensor.clone()}
+            changed[key][:, component] += 0.5
+            assert not torch.equal(encoder(changed), encoder(inputs))
+
+
 def test_tokens_survive_from_the_dataset_to_the_model_and_back_to_words(make_planner, batch, dataset):
     policy, preprocessor, _ = make_planner()
     tokens = preprocessor(batch)["observation.symbolic_plan"]
