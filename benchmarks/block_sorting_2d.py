@@ -9,6 +9,7 @@ Records the dataset if it is not there, runs `lerobot-train --config_path=config
 import argparse
 import json
 import math
+import os
 import subprocess
 import sys
 import time
@@ -21,9 +22,13 @@ OUTPUTS = Path("outputs/benchmarks")
 
 
 def run(command: str, *arguments: str) -> float:
-    """Run an installed command and return how long it took, in seconds."""
+    """Run an installed command and return how long it took, in seconds.
+
+    With one thread a process: on 2 cores, a second thread would only fight with the data loader's worker.
+    """
     start = time.perf_counter()
-    subprocess.run([Path(sys.executable).with_name(command), *arguments], check=True)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run([Path(sys.executable).with_name(command), *arguments], check=True, env=environment)
     return time.perf_counter() - start
 
 

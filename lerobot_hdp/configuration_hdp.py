@@ -73,8 +73,8 @@ class HDPConfig(PreTrainedConfig):
         num_train_timesteps: N, steps of the Gaussian process.
         prediction_type: what is predicted of the motion: `epsilon` (the noise), `sample` (the clean motion) or
             `v_prediction`.
-        symbol_loss_weight: lambda, weight of the symbols' loss beside the motion's. The paper's 1/30 balances it against
-            the error of the noise; that of the clean motion is about ten times smaller.
+        symbol_loss_weight: lambda, weight of the symbols' loss beside the motion's. The paper's 1/30 balances it
+            against the error of the noise; that of the clean motion is about ten times smaller.
         ema_power, ema_max_decay: the weights that plan are an exponential moving average with the decay
             min(1 - (1 + update)^-ema_power, ema_max_decay), as in Diffusion Policy. `ema_max_decay` 0 switches it off.
 
