@@ -84,6 +84,8 @@ class RecordConfig:
     def __post_init__(self):
         if self.dataset.num_episodes < 1 or self.num_workers < 1:
             raise ParsingError("--dataset.num_episodes and --num_workers must be at least 1")
+        if self.env.obs_type != "state":
+            raise ParsingError("hdp-record writes no camera images yet: leave --env.obs_type at state")
 
     @property
     def root(self) -> Path:

@@ -1,0 +1,46 @@
+"""What a user gets from `pip install` instead of a clone."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from .conftest import REPOSITORY
+
+CHECK = """
+import gymnasium, lerobot_policy_hdp, gym_hdp_tasks
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs import EnvConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+register_third_party_plugins()
+assert "hdp" in PreTrainedConfig.get_known_choices()
+assert "hdp" in EnvConfig.get_known_choices()
+gymnasium.make("hdp/XArmSorting-v0").reset(seed=0)
+print(lerobot_policy_hdp.__file__)
+"""
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """The wheel, installed without its dependencies, which the test environment has."""
+    folder = tmp_path_factory.mktemp("wheel")
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", folder, REPOSITORY], check=True)
+    [wheel] = folder.glob("*.whl")
+    subprocess.run([*pip, "install", "--no-deps", "--target", folder / "site", wheel], check=True)
+    return folder / "site"
+
+
+def test_lerobot_finds_the_plugin_from_any_folder(installed, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(installed)}
+    result = subprocess.run(
+        [sys.executable, "-c", CHECK], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == str(installed / "lerobot_policy_hdp.py")
+
+
+def test_train_configs_are_installed(installed):
+    shipped = {path.name for path in (installed / "share/lerobot_policy_hdp/configs").glob("*.json")}
+    assert shipped == {path.name for path in (REPOSITORY / "configs").glob("*.json")}
