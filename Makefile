@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 OUT := outputs/quickstart
 CONFIG := configs/block_sorting_2d_2_blocks.json
-ENV := --env.type=hdp --env.task=BlockSorting2D-v0 --env.n_blocks=2 --env.waypoints_per_pose=1
+TASK := --env.task=BlockSorting2D-v0 --env.n_blocks=2 --env.waypoints_per_pose=1
 
 export MUJOCO_GL ?= egl
 export TOKENIZERS_PARALLELISM = false
@@ -25,7 +25,7 @@ setup: .venv/.installed
 
 # The main job. Each step is skipped when it was done before; an interrupted one goes on.
 quickstart: setup
-	test -e $(OUT)/dataset || $(BIN)/hdp-record $(ENV) --resume=true --num_workers=2 \
+	test -e $(OUT)/dataset || $(BIN)/hdp-record $(TASK) --resume=true --num_workers=2 \
 		--dataset.repo_id=local/block_sorting_2d_2_blocks --dataset.root=$(OUT)/dataset --dataset.num_episodes=200
 	@if [ -e $(OUT)/train/checkpoints/last ]; then \
 		$(BIN)/lerobot-train --resume=true --config_path=$(OUT)/train/checkpoints/last/pretrained_model/train_config.json; \
@@ -33,7 +33,7 @@ quickstart: setup
 		rm -rf $(OUT)/train; \
 		$(BIN)/lerobot-train --config_path=$(CONFIG) --dataset.root=$(OUT)/dataset --output_dir=$(OUT)/train; \
 	fi
-	$(BIN)/lerobot-eval --policy.path=$(OUT)/train/checkpoints/last/pretrained_model $(ENV) --eval.n_episodes=50 \
+	$(BIN)/lerobot-eval --policy.path=$(OUT)/train/checkpoints/last/pretrained_model --env.type=hdp $(TASK) --eval.n_episodes=50 \
 		--eval.batch_size=50 --eval.use_async_envs=false --output_dir=$(OUT)/eval
 	$(BIN)/hdp-plan --policy.path=$(OUT)/train/checkpoints/last/pretrained_model --seed=1 --output_dir=$(OUT)/plan
 	@$(BIN)/python -c "import json; r = json.load(open('$(OUT)/eval/eval_info.json'))['overall']; \

@@ -108,8 +108,3 @@ class HDPEnv(EnvConfig):
                 "camera_width": self.camera_width,
             }
         return kwargs
-
-    @classmethod
-    def default_choice_name(cls) -> str:
-        """Where only these tasks make sense (`hdp-record`), `--env.type=hdp` can be left out."""
-        return "hdp"
