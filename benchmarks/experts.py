@@ -1,6 +1,6 @@
 """How often the experts succeed by the environments' own scores, what they choose, and how fast.
 
-python benchmarks/experts.py --num_episodes 1000
+python -m benchmarks.experts --num_episodes 1000
 
 Writes one JSON file for each task to `benchmarks/results/`. `physics_fraction` is the share of the time of resets,
 experts and steps together that is spent inside `mj_step`.
@@ -14,10 +14,12 @@ from pathlib import Path
 
 import gymnasium as gym
 import mujoco
-import numpy as np
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
+from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
+
+from .machine import describe_run
 
 RESULTS = Path(__file__).parent / "results"
 XARM_TASKS = [gym_id for gym_id in EXPERTS if "XArm" in gym_id]
@@ -35,15 +37,6 @@ class TimedPhysics:
         self._mj_step(model, data)
         self.seconds += time.perf_counter() - start
         self.steps += 1
-
-
-def expert_generator(seed: int) -> np.random.Generator:
-    """The expert's own random numbers.
-
-    Seeded with the bare seed they would be those that the environment's reset drew, and the choices would follow from
-    the start.
-    """
-    return np.random.default_rng([seed, 1])
 
 
 def measure(gym_id: str, num_episodes: int, robot: str) -> dict:
@@ -84,6 +77,7 @@ def main() -> None:
     options = parser.parse_args()
     for gym_id in options.tasks:
         result = measure(gym_id, options.num_episodes, options.robot)
+        result = {"run": describe_run(), **result}
         print(json.dumps(result, indent=2), flush=True)
         name = gym_id.removeprefix("hdp/").removesuffix("-v0")
         suffix = "" if options.robot == "primitive" else f"_{options.robot}"

@@ -1,6 +1,6 @@
 """How fast plans are scored: by `execute_plans`, by processes that step the environment, and by stepping one.
 
-python benchmarks/open_loop.py --num_plans 100
+python -m benchmarks.open_loop --num_plans 100
 
 All execute the same plans for the same seeds, and their scores must agree. Processes count their start, as every batch
 of plans would. Bare physics is the `mj_step`s alone, in native calls: no inverse kinematics, no scores.
@@ -19,6 +19,7 @@ import gymnasium as gym
 import numpy as np
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
+from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
 from gym_hdp_tasks import open_loop
 from gym_hdp_tasks.open_loop import execute_plans
@@ -34,7 +35,7 @@ def expert_plans(gym_id: str, num_plans: int) -> np.ndarray:
     plans = []
     for seed in range(num_plans):
         env.reset(seed=seed)
-        plans.append(EXPERTS[gym_id](env, np.random.default_rng([seed, 1])).waypoints)
+        plans.append(EXPERTS[gym_id](env, expert_generator(seed)).waypoints)
     return np.stack(plans)
 
 

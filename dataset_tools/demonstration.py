@@ -42,6 +42,14 @@ Expert = Callable[[gym.Env, np.random.Generator], Demonstration]
 equally good choices."""
 
 
+def expert_generator(seed: int) -> np.random.Generator:
+    """The expert's own random numbers, for an environment that was reset with the same seed.
+
+    Seeded with the bare seed, they would be those that the reset drew, and the choices would follow from the start.
+    """
+    return np.random.default_rng([seed, 1])
+
+
 def hold_last_waypoint(waypoints: list[np.ndarray], horizon: int) -> np.ndarray:
     """Stack waypoints and repeat the last until the horizon is reached: (horizon, action size) float32.
 

@@ -34,7 +34,7 @@ import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from gym_hdp_tasks import PlanningTask
 from gym_hdp_tasks.env_config import HDPEnv
 
-from .demonstration import Demonstration, Expert
+from .demonstration import Demonstration, Expert, expert_generator
 from .experts import EXPERTS
 
 SYMBOLIC_PLAN = "observation.symbolic_plan"
@@ -125,8 +125,7 @@ def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
 def demonstrate(env: gym.Env, expert: Expert, seed: int) -> Episode:
     """Reset the environment, let the expert plan, and execute its plan to the end."""
     observation, _ = env.reset(seed=seed)
-    # Not the seed alone: that would be the environment's own stream, and the choices would follow from the start.
-    demonstration = expert(env, np.random.default_rng([seed, 1]))
+    demonstration = expert(env, expert_generator(seed))
     task: PlanningTask = env.unwrapped.planning_task  # type: ignore[attr-defined]
     frames, score = [], 0.0
     for frame, action in enumerate(demonstration.waypoints):
@@ -201,12 +200,14 @@ def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = Non
     Returns:
         How many attempts failed, for the episodes that needed more than one.
     """
+    if is_complete(shard):
+        return failed_attempts(shard)
     datasets.disable_progress_bars()  # one for every episode otherwise
     task = config.env.planning_task
     if shard.root.exists() and not shard.done_file.exists():
         shutil.rmtree(shard.root)  # killed while it was written: its files have no footers
     if shard.root.exists():
-        failed = {int(k): v for k, v in json.loads(shard.done_file.read_text()).items()}
+        failed = failed_attempts(shard)
         dataset = LeRobotDataset.resume(config.dataset.repo_id, root=shard.root, video_backend="pyav")
     else:
         failed = {}
@@ -297,6 +298,11 @@ def plan_shards(config: RecordConfig) -> list[Shard]:
 def is_complete(shard: Shard) -> bool:
     """Whether a shard holds all of its episodes."""
     return shard.done_file.exists() and load_info(shard.root).total_episodes == shard.stop - shard.start
+
+
+def failed_attempts(shard: Shard) -> dict[int, int]:
+    """How many attempts failed, for the episodes of a shard on disk that needed more than one."""
+    return {int(episode): attempts for episode, attempts in json.loads(shard.done_file.read_text()).items()}
 
 
 def merge_shards(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) -> LeRobotDataset:

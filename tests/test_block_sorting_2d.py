@@ -8,6 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import gym_hdp_tasks  # noqa: F401
+from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
 from dataset_tools.experts.cycle_sort import cycle_sort
 from gym_hdp_tasks.block_sorting_2d import GRASP_RADIUS, SLOT_HALF_SIZE
@@ -64,7 +65,7 @@ def test_the_expert_always_succeeds_within_the_horizon(n_blocks, waypoints_per_p
     env = make(n_blocks, waypoints_per_pose)
     for seed in range(30):
         env.reset(seed=seed)
-        demonstration = EXPERTS[TASK_ID](env, np.random.default_rng(seed))
+        demonstration = EXPERTS[TASK_ID](env, expert_generator(seed))
         for action in demonstration.waypoints[:-1]:
             _, reward, terminated, truncated, info = env.step(action)
             assert (terminated, truncated, reward, info["is_success"]) == (False, False, 0.0, False)

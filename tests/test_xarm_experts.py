@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
+from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
 from dataset_tools.experts.xarm_arrange_blocks import possible_moves
 from gym_hdp_tasks.xarm_arrange_blocks import SLOT_CENTRES
@@ -15,7 +16,7 @@ from .test_xarm_env import IDS, ROBOTS
 def demonstrate(gym_id, seed, **kwargs):
     env = gym.make(gym_id, disable_env_checker=True, **kwargs).unwrapped
     env.reset(seed=seed)
-    return env, EXPERTS[gym_id](env, np.random.default_rng([seed, 1]))
+    return env, EXPERTS[gym_id](env, expert_generator(seed))
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -68,7 +69,7 @@ def test_every_plan_that_could_be_chosen_is_chosen(gym_id, n_plans):
     plans = set()
     for seed in range(500):
         env.reset(seed=seed)
-        plans.add(tuple(EXPERTS[gym_id](env, np.random.default_rng([seed, 1])).remaining_symbols(0)))
+        plans.add(tuple(EXPERTS[gym_id](env, expert_generator(seed)).remaining_symbols(0)))
     assert len(plans) == n_plans
 
 

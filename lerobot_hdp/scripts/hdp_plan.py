@@ -6,8 +6,10 @@ Example:
 
 import logging
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -67,8 +69,21 @@ class PlanConfig:
         return ["policy"]
 
 
-class Result(dict):
-    """What `make_plan` found: `symbols`, `score`, `is_success` and the paths of the pictures."""
+class Result(NamedTuple):
+    """What became of a plan.
+
+    Attributes:
+        symbols: the plan in words, without PAD.
+        score: of the episode, in [0, 1].
+        is_success: what the environment says.
+        picture, animation: the files that were written.
+    """
+
+    symbols: list[str]
+    score: float
+    is_success: bool
+    picture: Path
+    animation: Path
 
 
 def make_plan(config: PlanConfig) -> Result:
@@ -102,9 +117,9 @@ def make_plan(config: PlanConfig) -> Result:
             return postprocessor(motion[0]).numpy()
 
         config.output_dir.mkdir(parents=True, exist_ok=True)
-        pictures = _draw(config, env, policy, plan, prompt, states, unnormalise)
-        info = _execute(env, unnormalise(plan.actions))
-        return Result(symbols=plan.symbols(), token_probabilities=plan.token_probabilities, **info, **pictures)
+        picture, animation = _draw(config, env, policy, plan, prompt, states, unnormalise)
+        score, is_success = _execute(env, unnormalise(plan.actions))
+        return Result(plan.symbols(), score, is_success, picture, animation)
     finally:
         close_envs(vector_envs)
 
@@ -121,8 +136,16 @@ def _prompt(config: PlanConfig, policy: HDPPolicy, batch: dict[str, Tensor]) -> 
     return None
 
 
-def _draw(config, env, policy, plan: Plan, prompt, states, unnormalise) -> dict[str, Path]:
-    """Write `plan.png` and `denoising.gif`."""
+def _draw(
+    config: PlanConfig,
+    env: gym.vector.VectorEnv,
+    policy: HDPPolicy,
+    plan: Plan,
+    prompt: PlanPrompt | None,
+    states: list[DenoisingState],
+    unnormalise: Callable[[Tensor], np.ndarray],
+) -> tuple[Path, Path]:
+    """Write `plan.png` and `denoising.gif`, and say where they are."""
     scene = env.call("render")[0]
     length = max(len(plan.symbols()), 1)
     rows = -(-length // WORDS_PER_ROW) if policy.vocabulary else 0
@@ -142,10 +165,10 @@ def _draw(config, env, policy, plan: Plan, prompt, states, unnormalise) -> dict[
     last = len(states) - 1
     chosen = sorted({round(i) for i in np.linspace(0, last, min(ANIMATION_FRAMES, last + 1))})
     frames = [picture(states[i].motion, states[i].tokens, f"step {i} of {last}") for i in chosen]
-    files = {"picture": config.output_dir / "plan.png", "animation": config.output_dir / "denoising.gif"}
-    picture(plan.actions, plan.token_ids, f"plan from seed {config.seed}").save(files["picture"])
-    save_animation(frames, files["animation"])
-    return files
+    picture_file, animation_file = config.output_dir / "plan.png", config.output_dir / "denoising.gif"
+    picture(plan.actions, plan.token_ids, f"plan from seed {config.seed}").save(picture_file)
+    save_animation(frames, animation_file)
+    return picture_file, animation_file
 
 
 def _project(env: gym.vector.VectorEnv, actions: np.ndarray, scene: np.ndarray) -> np.ndarray:
@@ -156,26 +179,26 @@ def _project(env: gym.vector.VectorEnv, actions: np.ndarray, scene: np.ndarray) 
         raise ValueError("this environment has no world_to_pixels(points): its plans cannot be drawn") from error
 
 
-def _execute(env: gym.vector.VectorEnv, actions: np.ndarray) -> dict[str, float | bool]:
-    """Step through a plan and report the end of the episode."""
+def _execute(env: gym.vector.VectorEnv, actions: np.ndarray) -> tuple[float, bool]:
+    """Step through a plan; the score and the success at its end."""
     for action in actions:
         _, reward, terminated, truncated, info = env.step(action[None])
         if terminated[0] or truncated[0]:
             final = info.get("final_info", info)
-            return {"score": float(reward[0]), "is_success": bool(final["is_success"][0])}
-    return {"score": float(reward[0]), "is_success": bool(info["is_success"][0])}
+            return float(reward[0]), bool(final["is_success"][0])
+    return float(reward[0]), bool(info["is_success"][0])
 
 
 def print_plan(result: Result) -> None:
     """The plan in words, six to a line, and where the pictures are."""
-    symbols = result["symbols"]
+    symbols = result.symbols
     print("plan:")
     for start in range(0, len(symbols), WORDS_PER_ROW):
         print("   ", " ".join(symbols[start : start + WORDS_PER_ROW]))
     if not symbols:
         print("    (no symbols)")
-    print(f"executed: score {result['score']:.2f}, {'success' if result['is_success'] else 'failure'}")
-    print(f"picture: {result['picture']}\nanimation: {result['animation']}")
+    print(f"executed: score {result.score:.2f}, {'success' if result.is_success else 'failure'}")
+    print(f"picture: {result.picture}\nanimation: {result.animation}")
 
 
 @parser.wrap()

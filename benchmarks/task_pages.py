@@ -1,13 +1,13 @@
-"""Write what `benchmarks/results/` says into the pages of this folder, below their heading `## Measured`.
+"""Write what `benchmarks/results/` says into the pages of `docs/tasks/`, below their heading `## Measured`.
 
-python docs/tasks/write_figures.py
+python -m benchmarks.task_pages
 """
 
 import json
 from pathlib import Path
 
-FOLDER = Path(__file__).parent
-RESULTS = FOLDER.parents[1] / "benchmarks" / "results"
+FOLDER = Path(__file__).parents[1] / "docs" / "tasks"
+RESULTS = Path(__file__).parent / "results"
 PAGES = {
     "xarm_sorting.md": ["XArmSorting"],
     "xarm_arrange_blocks.md": ["XArmArrangeBlocks"],
@@ -29,7 +29,7 @@ def expert_table(task: str) -> str:
 | episodes per second, one process | {own["episodes_per_second"]:.1f} |
 | time inside `mj_step` | {own["physics_fraction"]:.0%} |
 
-`python benchmarks/experts.py --tasks {own["task"]} --num_episodes {own["num_episodes"]}`
+`python -m benchmarks.experts --tasks {own["task"]} --num_episodes {own["num_episodes"]}`
 """
 
 
@@ -49,7 +49,7 @@ def open_loop_table() -> str:
         lines.append(f"| {task} | {' | '.join(f'{speed:.1f}' for speed in speeds)} |")
     agree = all(result["scores_agree"] for result in results.values())
     lines += ["", f"{any_result['num_plans']} plans on {any_result['num_cores']} cores; all scores agree: {agree}."]
-    lines += ["", f"`python benchmarks/open_loop.py --num_plans {any_result['num_plans']}`", ""]
+    lines += ["", f"`python -m benchmarks.open_loop --num_plans {any_result['num_plans']}`", ""]
     return "\n".join(lines)
 
 

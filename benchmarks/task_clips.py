@@ -1,6 +1,6 @@
-"""Record the clips of this folder: the expert at work, with the step of its plan that is being done.
+"""Record the clips of `docs/tasks/`: the expert at work, with the step of its plan that is being done.
 
-MUJOCO_GL=egl python docs/tasks/record_clips.py
+MUJOCO_GL=egl python -m benchmarks.task_clips
 """
 
 from pathlib import Path
@@ -12,9 +12,10 @@ import numpy as np
 from PIL import Image
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
+from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
 
-FOLDER = Path(__file__).parent
+FOLDER = Path(__file__).parents[1] / "docs" / "tasks"
 FRAMES_PER_SECOND = 12
 """Of the clip."""
 CAPTURES_PER_SECOND = 3
@@ -28,7 +29,7 @@ def record(gym_id: str) -> list[np.ndarray]:
     """Frames (HEIGHT + CAPTION_HEIGHT, WIDTH, 3) of one demonstration, up to the end of its plan."""
     env = gym.make(gym_id, render_mode="rgb_array", disable_env_checker=True).unwrapped
     env.reset(seed=SEED)
-    demonstration = EXPERTS[gym_id](env, np.random.default_rng([SEED, 1]))
+    demonstration = EXPERTS[gym_id](env, expert_generator(SEED))
     physics_steps_per_capture = round(1 / CAPTURES_PER_SECOND / env.model.opt.timestep)
     frames = []
     for step, waypoint in enumerate(demonstration.waypoints[: demonstration.steps[-1].stop]):
