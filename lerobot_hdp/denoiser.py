@@ -107,7 +107,7 @@ class Denoiser(nn.Module):
 
         condition_tokens = 1 + int(self.models_symbols) + observation_tokens
         self.condition_positions = nn.Parameter(torch.empty(1, condition_tokens, width))
-        self.condition_encoder = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.condition_encoder = ConditionEncoder(width, normalise_condition)
         layer = nn.TransformerDecoderLayer(
             width, num_heads, 4 * width, dropout, activation="gelu", batch_first=True, norm_first=True
         )

@@ -39,6 +39,23 @@ def test_a_plan_depends_on_every_observation(make_planner, batch, object_tokens)
             assert not torch.equal(encoder(changed), encoder(inputs))
 
 
+def test_normalised_condition_tokens_are_seen_from_the_first_step_on(make_planner, batch):
+    def change_of_prediction(normalise_condition):
+        policy, preprocessor, _ = make_planner(normalise_condition=normalise_condition)
+        inputs = preprocessor(batch)
+        motion, tokens = inputs["action"], inputs["observation.symbolic_plan"]
+        level = torch.full((len(motion),), 0.5)
+        shifted = {key: value + 0.2 for key, value in observation(inputs).items()}
+        planner = policy.eval().planner
+        before, after = (
+            planner.denoiser(motion, tokens, planner.encoder(seen), level, level).motion
+            for seen in (observation(inputs), shifted)
+        )
+        return (after - before).std() / before.std()
+
+    assert change_of_prediction(True) > 3 * change_of_prediction(False)
+
+
 def test_tokens_survive_from_the_dataset_to_the_model_and_back_to_words(make_planner, batch, dataset):
     policy, preprocessor, _ = make_planner()
     tokens = preprocessor(batch)["observation.symbolic_plan"]
