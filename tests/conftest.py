@@ -26,7 +26,7 @@ TINY_PLANNER = {"horizon": HORIZON, "num_layers": 1, "num_heads": 2, "width": 32
 def run_command(command: str, *arguments, check: bool = True, cwd: Path | None = None) -> subprocess.CompletedProcess:
     """Run an installed command, as a user would, without a network."""
     executable = Path(sys.executable).with_name(command)
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "2"}
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
     result = subprocess.run(
         [executable, *map(str, arguments)], capture_output=True, text=True, cwd=cwd or REPOSITORY, env=environment
     )

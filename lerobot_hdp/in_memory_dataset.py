@@ -1,0 +1,138 @@
+"""A LeRobotDataset held in memory as tensors, which gives whole batches at once.
+
+LeRobot reads a batch item by item: with a horizon of 145 actions, one item takes several milliseconds. Here, a batch is
+one gather in each column. PyTorch's data loader asks for it through `__getitems__`.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.language import LANGUAGE_COLUMNS
+from lerobot.datasets.video_utils import decode_video_frames
+from torch import Tensor
+from torch.utils.data._utils.collate import default_collate_fn_map
+from tqdm import tqdm
+
+
+class Batch(dict):
+    """A batch that is collated already. A data loader gets it as a list of this one, see `collate`."""
+
+
+def collate(batches: list[Batch], *, collate_fn_map: Any = None) -> Batch:
+    """The batch of a list of one."""
+    [batch] = batches
+    return batch
+
+
+default_collate_fn_map[Batch] = collate
+
+
+class InMemoryDataset(LeRobotDataset):
+    """A LeRobotDataset that gives the same samples from memory: `dataset.__getitems__(indices)`.
+
+    Cameras are decoded once and kept as uint8.
+
+    Args:
+        dataset: what to load; `unsupported(dataset)` must be None.
+
+    Raises:
+        ValueError: the dataset has columns that are no tensors.
+    """
+
+    def __init__(self, dataset: LeRobotDataset):
+        vars(self).update(vars(dataset))
+        if (reason := unsupported(dataset)) is not None:
+            raise ValueError(f"{dataset.repo_id} cannot be held in memory: {reason}")
+        self._columns, self._words = _read_columns(dataset)
+        self._columns |= {key: _decode_videos(dataset, key) for key in self.meta.video_keys}
+        episodes = self._columns["episode_index"]
+        _, inverse, lengths = episodes.unique_consecutive(return_inverse=True, return_counts=True)
+        ends = lengths.cumsum(0)
+        self._first, self._last = (ends - lengths)[inverse], (ends - 1)[inverse]
+        self._offsets = {key: torch.tensor(deltas) for key, deltas in (self.reader.delta_indices or {}).items()}
+        self._tasks = list(self.meta.tasks.index)
+
+    def __getitems__(self, indices: list[int]) -> list[Batch]:
+        """The samples of some frames, collated: each column (B, ...), or (B, T, ...) where it has delta timestamps."""
+        rows = torch.tensor(indices)
+        first, last = self._first[rows, None], self._last[rows, None]
+        batch = Batch({key: [words[i] for i in indices] for key, words in self._words.items()})
+        for key, column in self._columns.items():
+            if key not in self._offsets:
+                batch[key] = column[rows]
+                continue
+            window = rows[:, None] + self._offsets[key]
+            batch[key] = column[torch.minimum(torch.maximum(window, first), last)]
+            batch[f"{key}_is_pad"] = (window < first) | (window > last)
+            if key in self.meta.video_keys and window.shape[1] == 1:
+                batch[key] = batch[key].squeeze(1)  # as LeRobot has it
+        self._finish_images(batch)
+        batch["task"] = [self._tasks[i] for i in batch["task_index"].tolist()]
+        return [batch]
+
+    def _finish_images(self, batch: Batch) -> None:
+        """uint8 to float where LeRobot has it so, and the image transforms, sample by sample as LeRobot draws them."""
+        for key in self.meta.camera_keys:
+            if key in self.meta.image_keys or not self._return_uint8:
+                batch[key] = batch[key].float() / 255
+        if self.image_transforms is not None:
+            cameras = self.meta.camera_keys
+            samples = zip(*(batch[key] for key in cameras), strict=True)
+            images = [[self.image_transforms(image) for image in sample] for sample in samples]
+            batch.update(zip(cameras, map(torch.stack, zip(*images, strict=True)), strict=True))
+
+
+def unsupported(dataset: LeRobotDataset) -> str | None:
+    """Why a dataset cannot be held in memory, in words; None if it can."""
+    if not isinstance(dataset, LeRobotDataset):
+        return "it is streamed"
+    if dataset.meta.depth_keys:
+        return f"{dataset.meta.depth_keys[0]} holds depth maps"
+    return None
+
+
+def memory_needed(dataset: LeRobotDataset) -> int:
+    """Bytes that the dataset takes as tensors."""
+    per_frame = 0
+    for key, feature in dataset.meta.features.items():
+        if key not in LANGUAGE_COLUMNS and feature["dtype"] != "string":
+            size = 1 if key in dataset.meta.camera_keys else 8 if "int" in feature["dtype"] else 4
+            per_frame += size * math.prod(feature["shape"])
+    return per_frame * dataset.num_frames
+
+
+def _read_columns(dataset: LeRobotDataset) -> tuple[dict[str, Tensor], dict[str, list[str]]]:
+    """Columns of the dataset's table as tensors (N, ...), of the types that LeRobot makes them; and those of words."""
+    table = dataset.hf_dataset.with_format(None)
+    columns, words = {}, {}
+    for key in table.column_names:
+        if key in LANGUAGE_COLUMNS:
+            continue  # LeRobot leaves them out of a batch, too
+        if key in dataset.meta.image_keys:
+            images = (torch.from_numpy(np.array(row[key])) for row in table.select_columns(key))
+            columns[key] = torch.stack([image.reshape(*image.shape[:2], -1).permute(2, 0, 1) for image in images])
+        elif dataset.meta.features[key]["dtype"] == "string":
+            words[key] = table[key][:]
+        else:
+            values = np.stack(table.with_format("numpy")[:][key])
+            kind = {"f": np.float32, "i": np.int64, "u": np.int64, "b": np.bool_}[values.dtype.kind]
+            columns[key] = torch.from_numpy(values.astype(kind))
+    return columns, words
+
+
+def _decode_videos(dataset: LeRobotDataset, key: str) -> Tensor:
+    """All frames of a camera: (N, C, H, W) uint8."""
+    episodes = range(dataset.meta.total_episodes) if dataset.episodes is None else dataset.episodes
+    frames = []
+    for index in tqdm(episodes, desc=f"Decoding {key}", unit="episode"):
+        episode = dataset.meta.episodes[index]
+        start = episode[f"videos/{key}/from_timestamp"]
+        timestamps = [start + i / dataset.fps for i in range(episode["length"])]
+        path = dataset.root / dataset.meta.get_video_file_path(index, key)
+        frames.append(
+            decode_video_frames(path, timestamps, dataset.tolerance_s, dataset._video_backend, return_uint8=True)
+        )
+    return torch.cat(frames)

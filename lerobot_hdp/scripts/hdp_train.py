@@ -1,0 +1,107 @@
+"""`hdp-train`: LeRobot's own training, with the dataset in memory, for any policy and any dataset that fits.
+
+Takes all flags of `lerobot-train`, and does what it does with them, from checkpoints to `--resume` and `accelerate
+launch`: it runs LeRobot's training function. What it changes are three names in LeRobot's module, below, where LeRobot
+0.6.1 has no hook: the function that opens the datasets, the one that collates a batch with language columns, and, for
+`--max_train_minutes`, the two that decide about a checkpoint and do a step. A `dataset_factory` and a `should_stop`
+argument of `lerobot.scripts.lerobot_train.train` would make this unnecessary.
+
+Example:
+    hdp-train --config_path=configs/xarm_sorting.json --max_train_minutes=30
+"""
+
+import argparse
+import logging
+import sys
+import time
+from typing import Any
+
+import torch
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDataset
+from lerobot.scripts import lerobot_train
+
+from lerobot_hdp.in_memory_dataset import Batch, InMemoryDataset, memory_needed, unsupported
+
+GIB = 2**30
+
+
+class OutOfTimeError(Exception):
+    """Training stopped at `--max_train_minutes`, after a checkpoint."""
+
+
+def hold_datasets_in_memory(max_gib: float) -> None:
+    """Let `lerobot-train` hold its datasets in memory, if they need at most `max_gib` GiB; else it reads as always."""
+    make_datasets, collate = lerobot_train.make_train_eval_datasets, lerobot_train.lerobot_collate_fn
+
+    def make_datasets_in_memory(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
+        datasets = make_datasets(cfg)
+        for dataset in filter(None, datasets):
+            reason = unsupported(dataset)
+            if reason is None and memory_needed(dataset) > max_gib * GIB:
+                reason = f"it needs {memory_needed(dataset) / GIB:.1f} GiB, more than --max_memory_gib={max_gib:g}"
+            if reason is not None:
+                logging.warning("The dataset is read item by item, as by lerobot-train: %s", reason)
+                return datasets
+        cfg.num_workers = 0  # there is nothing to wait for
+        return tuple(None if dataset is None else InMemoryDataset(dataset) for dataset in datasets)
+
+    def collate_unless_collated(samples: list[Any]) -> Any:
+        return samples[0] if isinstance(samples[0], Batch) else collate(samples)
+
+    lerobot_train.make_train_eval_datasets = make_datasets_in_memory
+    lerobot_train.lerobot_collate_fn = collate_unless_collated
+
+
+def stop_after(minutes: float) -> None:
+    """Let `lerobot-train` write a checkpoint after some minutes, then raise OutOfTimeError."""
+    deadline = time.monotonic() + 60 * minutes
+    should_save, update_policy = lerobot_train.should_save_checkpoint, lerobot_train.update_policy
+    out_of_time = False
+
+    def should_save_or_stop(step: int, save_freq: int, total_steps: int) -> bool:
+        nonlocal out_of_time
+        out_of_time = _on_any_process(time.monotonic() >= deadline) and step < total_steps
+        return out_of_time or should_save(step, save_freq, total_steps)
+
+    def update_unless_out_of_time(*args: Any, **kwargs: Any) -> Any:
+        if out_of_time:
+            raise OutOfTimeError
+        return update_policy(*args, **kwargs)
+
+    lerobot_train.should_save_checkpoint = should_save_or_stop
+    lerobot_train.update_policy = update_unless_out_of_time
+
+
+def _on_any_process(flag: bool) -> bool:
+    """Whether a flag is set on any process of a distributed run, so that all of them stop at the same step."""
+    if not torch.distributed.is_initialized():
+        return flag
+    device = "cuda" if torch.distributed.get_backend() == "nccl" else "cpu"
+    flags = torch.tensor(float(flag), device=device)
+    torch.distributed.all_reduce(flags, torch.distributed.ReduceOp.MAX)
+    return bool(flags)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        "hdp-train", description="lerobot-train with the dataset in memory.", add_help=False, allow_abbrev=False
+    )
+    parser.add_argument("--max_train_minutes", type=float, help="write a checkpoint and stop after this time")
+    parser.add_argument("--max_memory_gib", type=float, default=8.0, help="largest dataset to hold in memory, in GiB")
+    options, sys.argv[1:] = parser.parse_known_args()
+    if "--help" in sys.argv or "-h" in sys.argv:
+        parser.print_help()
+    hold_datasets_in_memory(options.max_memory_gib)
+    if options.max_train_minutes is not None:
+        stop_after(options.max_train_minutes)
+    try:
+        lerobot_train.main()
+    except OutOfTimeError:
+        logging.info("Out of time after %g minutes. Go on with --resume=true.", options.max_train_minutes)
+        if torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+
+
+if __name__ == "__main__":
+    main()

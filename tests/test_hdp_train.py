@@ -1,0 +1,187 @@
+"""`hdp-train`: the same samples as LeRobot reads, the same training as `lerobot-train` does, from memory."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.transforms import ImageTransforms, ImageTransformsConfig
+from safetensors.torch import load_file
+from torch.utils.data import DataLoader, Subset
+
+from lerobot_hdp.in_memory_dataset import InMemoryDataset, memory_needed
+
+from .conftest import TINY_PLANNER, run_command
+
+FPS = 10
+STEPS = 6
+PLANNER_FLAGS = ("--policy.type=hdp", *(f"--policy.{name}={value}" for name, value in TINY_PLANNER.items()))
+DIFFUSION_FLAGS = ("--policy.type=diffusion", "--policy.down_dims=[16,32]", "--policy.crop_shape=[24,24]")
+ACT_FLAGS = ("--policy.type=act", "--policy.dim_model=32", "--policy.dim_feedforward=32", "--policy.n_heads=2")
+ACT_FLAGS += ("--policy.chunk_size=5", "--policy.n_action_steps=5", "--policy.pretrained_backbone_weights=null")
+
+
+@pytest.fixture(scope="module", params=["video", "image"])
+def camera_root(request, tmp_path_factory):
+    """Four short episodes of noise, with two cameras, a state and words, of different lengths."""
+    root = tmp_path_factory.mktemp("cameras") / request.param
+    camera = {"dtype": request.param, "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
+    vector = {"dtype": "float32", "shape": (3,), "names": None}
+    dataset = LeRobotDataset.create(
+        "test/cameras",
+        fps=FPS,
+        root=root,
+        features={
+            "observation.images.front": camera,
+            "observation.images.wrist": camera,
+            "observation.state": vector,
+            "action": vector,
+            "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+            "remark": {"dtype": "string", "shape": (1,), "names": None},
+        },
+    )
+    generator = np.random.default_rng(0)
+    for length in (7, 4, 9, 5):
+        for _ in range(length):
+            dataset.add_frame(
+                {
+                    "observation.images.front": generator.integers(0, 256, (32, 48, 3), dtype=np.uint8),
+                    "observation.images.wrist": generator.integers(0, 256, (32, 48, 3), dtype=np.uint8),
+                    "observation.state": generator.random(3, dtype=np.float32),
+                    "action": generator.random(3, dtype=np.float32),
+                    "next.reward": generator.random(1, dtype=np.float32),
+                    "remark": f"number {generator.integers(10)}",
+                    "task": f"task {length % 2}",
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def assert_same_samples(dataset: LeRobotDataset) -> None:
+    """What a data loader makes of 20 frames of the dataset, and of the dataset in memory."""
+    indices = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(1))[:20].tolist()
+    batches: dict[str, list] = {}
+    for name, source in {"LeRobot": dataset, "in memory": InMemoryDataset(dataset)}.items():
+        torch.manual_seed(0)
+        batches[name] = list(DataLoader(Subset(source, indices), batch_size=8))
+    assert len(batches["LeRobot"]) == 3
+    for batch, reference in zip(batches["in memory"], batches["LeRobot"], strict=True):
+        assert batch.keys() == reference.keys()
+        for key, value in reference.items():
+            if isinstance(value, torch.Tensor):
+                torch.testing.assert_close(batch[key], value, rtol=0, atol=0)
+            else:
+                assert batch[key] == value
+
+
+@pytest.mark.parametrize("episodes", [None, [5, 2, 11]])
+def test_samples_are_those_of_lerobot(dataset_root, episodes):
+    windows = {"action": [i / FPS for i in range(-1, 19)], "observation.state": [-0.1, 0.0]}
+    assert_same_samples(LeRobotDataset("test/sorting", root=dataset_root, episodes=episodes, delta_timestamps=windows))
+
+
+@pytest.mark.parametrize("return_uint8", [True, False])
+@pytest.mark.parametrize("offsets", [None, [0.0], [-0.2, 0.0, 0.1]])
+def test_images_are_those_of_lerobot(camera_root, offsets, return_uint8):
+    keys = ("observation.images.front", "observation.images.wrist", "observation.state")
+    windows = None if offsets is None else dict.fromkeys(keys, offsets)
+    assert_same_samples(
+        LeRobotDataset(
+            "test/cameras",
+            root=camera_root,
+            delta_timestamps=windows,
+            return_uint8=return_uint8,
+            video_backend="pyav",
+        )
+    )
+
+
+def test_image_transforms_are_drawn_as_by_lerobot(camera_root):
+    transforms = ImageTransforms(ImageTransformsConfig(enable=True))
+    assert_same_samples(
+        LeRobotDataset(
+            "test/cameras", root=camera_root, image_transforms=transforms, return_uint8=True, video_backend="pyav"
+        )
+    )
+
+
+def test_memory_needed_counts_every_tensor(camera_root):
+    dataset = LeRobotDataset("test/cameras", root=camera_root, video_backend="pyav", return_uint8=True)
+    columns = InMemoryDataset(dataset)._columns.values()
+    assert memory_needed(dataset) == pytest.approx(sum(c.numel() * c.element_size() for c in columns), rel=0.01)
+
+
+def train(command, root, output_dir, policy_flags, *flags):
+    return run_command(
+        command,
+        "--dataset.repo_id=test/dataset",
+        f"--dataset.root={root}",
+        "--dataset.video_backend=pyav",
+        f"--output_dir={output_dir}",
+        *policy_flags,
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        "--batch_size=8",
+        f"--steps={STEPS}",
+        f"--save_freq={STEPS}",
+        "--num_workers=0",
+        "--log_freq=1",
+        *flags,
+    )
+
+
+def weights(output_dir):
+    return load_file(output_dir / "checkpoints" / "last" / "pretrained_model" / "model.safetensors")
+
+
+def assert_same_weights(one, other):
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+def losses(result):
+    return re.findall(r" loss:([\d.]+)", result.stderr)
+
+
+@pytest.fixture(scope="module")
+def lerobot_train_run(dataset_root, tmp_path_factory):
+    output_dir = tmp_path_factory.mktemp("runs") / "lerobot_train"
+    return train("lerobot-train", dataset_root, output_dir, PLANNER_FLAGS), output_dir
+
+
+def test_the_planner_ends_with_the_weights_of_lerobot_train(dataset_root, lerobot_train_run, tmp_path):
+    expected, expected_dir = lerobot_train_run
+    result = train("hdp-train", dataset_root, tmp_path / "run", PLANNER_FLAGS)
+    assert len(losses(result)) == STEPS
+    assert losses(result) == losses(expected)
+    assert_same_weights(weights(tmp_path / "run"), weights(expected_dir))
+
+
+def test_a_run_that_is_out_of_time_leaves_a_checkpoint_and_goes_on_from_it(dataset_root, lerobot_train_run, tmp_path):
+    run = tmp_path / "run"
+    stopped = train("hdp-train", dataset_root, run, PLANNER_FLAGS, "--max_train_minutes=0")
+    assert "Go on with --resume=true" in stopped.stderr
+    assert [path.name for path in (run / "checkpoints").iterdir() if not path.is_symlink()] == ["000001"]
+    config = run / "checkpoints/last/pretrained_model/train_config.json"
+    run_command("hdp-train", f"--config_path={config}", "--resume=true", "--max_train_minutes=60")
+    assert_same_weights(weights(run), weights(lerobot_train_run[1]))
+
+
+def test_a_dataset_beyond_the_budget_is_read_as_by_lerobot_train(dataset_root, lerobot_train_run, tmp_path):
+    result = train("hdp-train", dataset_root, tmp_path / "run", PLANNER_FLAGS, "--max_memory_gib=0.0001")
+    assert "more than --max_memory_gib=0.0001" in result.stderr
+    assert_same_weights(weights(tmp_path / "run"), weights(lerobot_train_run[1]))
+
+
+@pytest.mark.parametrize("camera_root", ["video"], indirect=True)
+@pytest.mark.parametrize("policy_flags", [DIFFUSION_FLAGS, ACT_FLAGS], ids=["diffusion", "act"])
+def test_other_policies_train_with_cameras(camera_root, tmp_path, policy_flags):
+    flags = (*policy_flags, "--eval_steps=3", "--dataset.eval_split=0.1")
+    by_lerobot, in_memory = (
+        train(command, camera_root, tmp_path / command, flags) for command in ("lerobot-train", "hdp-train")
+    )
+    assert len(losses(by_lerobot)) == STEPS
+    assert losses(in_memory) == losses(by_lerobot)
