@@ -40,7 +40,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return tuple(round((centre + sign * spread) / (1 + z * z / trials), 4) for sign in (-1, 1))
 
 
-def measure(name: str, n_blocks: int, episodes: int, seed: int, *policy_flags: str) -> dict[str, object]:
+def measure(planner: str, n_blocks: int, episodes: int, seed: int) -> dict[str, object]:
     """Train one planner and evaluate it."""
     config = f"configs/block_sorting_2d_{n_blocks}_blocks.json"
     task_flags = ("--env.task=BlockSorting2D-v0", f"--env.n_blocks={n_blocks}", "--env.waypoints_per_pose=1")
@@ -53,8 +53,14 @@ def measure(name: str, n_blocks: int, episodes: int, seed: int, *policy_flags: s
             f"--dataset.repo_id=local/{dataset.name}",
             f"--dataset.root={dataset}",
         )
-    output = OUTPUTS / f"block_sorting_2d_{n_blocks}_blocks_{name}_seed{seed}"
-    train_s = run("lerobot-train", f"--config_path={config}", f"--output_dir={output}", f"--seed={seed}", *policy_flags)
+    output = OUTPUTS / f"block_sorting_2d_{n_blocks}_blocks_{planner}_seed{seed}"
+    train_s = run(
+        "lerobot-train",
+        f"--config_path={config}",
+        f"--policy.type={planner}",
+        f"--output_dir={output}",
+        f"--seed={seed}",
+    )
     checkpoint = output / "checkpoints" / "last" / "pretrained_model"
     run(
         "lerobot-eval",
@@ -70,7 +76,7 @@ def measure(name: str, n_blocks: int, episodes: int, seed: int, *policy_flags: s
     [task] = scores["per_task"]
     successes = sum(task["metrics"]["successes"])
     return {
-        "planner": name,
+        "planner": planner,
         "seed": seed,
         "train_minutes": round(train_s / 60, 1),
         "steps": json.loads((checkpoint / "train_config.json").read_text())["steps"],
@@ -81,20 +87,20 @@ def measure(name: str, n_blocks: int, episodes: int, seed: int, *policy_flags: s
     }
 
 
-PLANNERS = {"hdp": (), "diffuser": ("--policy.plan_symbols=false",)}
-"""Name to the flags that make it of the config."""
+PLANNERS = ("hdp", "diffuser")
+"""Policy types."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n_blocks", type=int, default=3)
-    parser.add_argument("--planners", nargs="+", choices=PLANNERS, default=list(PLANNERS))
+    parser.add_argument("--planners", nargs="+", choices=PLANNERS, default=PLANNERS)
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1000)
     options = parser.parse_args()
     for name in options.planners:
         run_facts = describe_run()
-        result = measure(name, options.n_blocks, options.episodes, options.seed, *PLANNERS[name])
+        result = measure(name, options.n_blocks, options.episodes, options.seed)
         path = RESULTS / f"block_sorting_2d_{options.n_blocks}_blocks_{name}.json"
         path.write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
         print(path.read_text())

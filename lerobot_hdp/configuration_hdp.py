@@ -1,7 +1,7 @@
 """Everything that can be set about the planner."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from draccus.utils import ParsingError
 from lerobot.configs import NormalizationMode, PreTrainedConfig
@@ -60,7 +60,6 @@ class HDPConfig(PreTrainedConfig):
         n_action_steps: actions that are executed before the next plan is made. None: the whole plan, open loop.
         plan_from: `episode_start` trains on the whole plan at the first frame of each episode, which must all be
             `horizon` frames long; `any_frame` on what remains of the plan at any frame, held at its end.
-        plan_symbols: False models the motion alone, which is Diffuser (Janner et al. 2022).
         vocabulary: the symbols, PAD first; read from the dataset.
 
         num_layers, num_heads, width, dropout: the transformer; `width` is the size of a token.
@@ -91,13 +90,17 @@ class HDPConfig(PreTrainedConfig):
             a ValueError behind "Couldn't instantiate class".
     """
 
+    symbol_process: ClassVar[str | None] = "masked"
+    """How symbols are corrupted: `masked` tokens, `gaussian` noise on one-hot vectors, None: there are none."""
+    shared_level: ClassVar[bool] = False
+    """Whether motion and symbols are always corrupted equally strongly (k_d = k_c), or independently."""
+
     preset: str = "default"
 
     horizon: int | None = None
     symbolic_horizon: int | None = None
     n_action_steps: int | None = None
     plan_from: str = "episode_start"
-    plan_symbols: bool = True
     vocabulary: list[str] | None = None
 
     num_layers: int = 8
@@ -171,7 +174,7 @@ class HDPConfig(PreTrainedConfig):
         self.input_features.pop(OBS_SYMBOLIC_PLAN, None)  # token ids are no numbers to normalise
         if self.observation_token_sizes is None:
             self.observation_token_sizes = self._token_sizes(features)
-        if self.plan_symbols:
+        if self.symbol_process is not None:
             self._set_symbols(features)
 
     def _token_sizes(self, features: dict[str, dict]) -> list[int]:
@@ -189,7 +192,7 @@ class HDPConfig(PreTrainedConfig):
         if OBS_SYMBOLIC_PLAN not in features:
             raise ValueError(
                 f"the dataset has no column '{OBS_SYMBOLIC_PLAN}'. Add one (README, 'Your own dataset'), or train "
-                "on the motion alone with --policy.plan_symbols=false."
+                "on the motion alone with --policy.type=diffuser."
             )
         feature = features[OBS_SYMBOLIC_PLAN]
         symbols = (feature.get("info") or {}).get("vocabulary")
@@ -218,7 +221,7 @@ class HDPConfig(PreTrainedConfig):
         if self.action_feature is None:
             raise ValueError("the dataset has no column 'action'")
         symbols_known = self.vocabulary is not None and self.symbolic_horizon is not None
-        if self.observation_token_sizes is None or (self.plan_symbols and not symbols_known):
+        if self.observation_token_sizes is None or (self.symbol_process is not None and not symbols_known):
             raise ValueError("a planner learns its sizes and its vocabulary from a dataset: train it before use")
 
     @property

@@ -15,12 +15,12 @@ class Prediction(NamedTuple):
 
     Attributes:
         motion: (B, H_c, D) the noise, the clean motion or v, as the Gaussian process was told.
-        logits: (B, H_d, m) scores of the m symbols; there is none for the mask, whose probability is zero. None
-            where no symbols are modelled.
+        symbols: (B, H_d, m) of each of the m symbols, what their process learns: for the masked process its score
+            (there is none for the mask, whose probability is zero). None where no symbols are modelled.
     """
 
     motion: Tensor
-    logits: Tensor | None
+    symbols: Tensor | None
 
 
 class SinusoidalEmbedding(nn.Module):
@@ -58,7 +58,7 @@ class ConditionEncoder(nn.Module):
 
 
 class Denoiser(nn.Module):
-    """(motion prediction, token logits) = D_theta(A_c, A_d, O, k_c, k_d).
+    """(motion prediction, symbol prediction) = D_theta(A_c, A_d, O, k_c, k_d).
 
     Diffusion Policy's transformer (Chi et al. 2023): the plan's tokens attend to each other, without a causal mask,
     and to the condition tokens. Motion and symbols are embedded by a linear layer each and concatenated in time, so
@@ -71,6 +71,8 @@ class Denoiser(nn.Module):
         num_train_timesteps: N; k_c is embedded as a training step.
         vocabulary_size: m.
         symbolic_horizon: H_d; 0 models the motion alone (Diffuser).
+        symbol_states: size of the vector that stands for a symbol.
+        shared_level: k_d is always k_c, so that only the latter is a condition.
         num_layers, num_heads, width, dropout: of the transformer. Dropout acts in attention and feed-forward layers.
         normalise_condition: make the condition tokens of a size that attention can read from the first step on; False
             leaves them as small as Diffusion Policy's initialisation makes them.
@@ -84,6 +86,8 @@ class Denoiser(nn.Module):
         num_train_timesteps: int,
         vocabulary_size: int,
         symbolic_horizon: int,
+        symbol_states: int,
+        shared_level: bool,
         num_layers: int,
         num_heads: int,
         width: int,
@@ -93,19 +97,22 @@ class Denoiser(nn.Module):
         super().__init__()
         self.horizon = horizon
         self.num_train_timesteps = num_train_timesteps
-        self.vocabulary_size = vocabulary_size
+        self.symbol_states = symbol_states
         self.models_symbols = symbolic_horizon > 0
+        self.embeds_symbol_level = self.models_symbols and not shared_level
 
         self.embed_motion = nn.Linear(action_dim, width)
         self.embed_motion_level = SinusoidalEmbedding(width)
         self.motion_head = nn.Linear(width, action_dim)
         if self.models_symbols:
-            self.embed_symbols = nn.Linear(vocabulary_size + 1, width)  # one-hot, with the mask as one more state
+            self.embed_symbols = nn.Linear(symbol_states, width)
+        if self.embeds_symbol_level:
             self.embed_symbol_level = nn.Sequential(nn.Linear(1, width), nn.Mish(), nn.Linear(width, width))
+        if self.models_symbols:
             self.symbol_head = nn.Linear(width, vocabulary_size)
         self.positions = nn.Parameter(torch.empty(1, horizon + symbolic_horizon, width))
 
-        condition_tokens = 1 + int(self.models_symbols) + observation_tokens
+        condition_tokens = 1 + int(self.embeds_symbol_level) + observation_tokens
         self.condition_positions = nn.Parameter(torch.empty(1, condition_tokens, width))
         self.condition_encoder = ConditionEncoder(width, normalise_condition)
         layer = nn.TransformerDecoderLayer(
@@ -117,13 +124,14 @@ class Denoiser(nn.Module):
         nn.init.normal_(self.condition_positions, std=0.02)
 
     def forward(
-        self, motion: Tensor, tokens: Tensor | None, observation: Tensor, motion_level: Tensor, symbol_level: Tensor
+        self, motion: Tensor, symbols: Tensor | None, observation: Tensor, motion_level: Tensor, symbol_level: Tensor
     ) -> Prediction:
         """Predict the clean plan behind a corrupted one.
 
         Args:
             motion: (B, H_c, D) noisy motion A_c.
-            tokens: (B, H_d) partly masked token ids A_d; None where no symbols are modelled.
+            symbols: corrupted symbols A_d, as (B, H_d) token ids or as (B, H_d, symbol_states) noisy one-hot vectors;
+                None where no symbols are modelled.
             observation: (B, n, width) encoded observation O.
             motion_level: (B,) k_c in [0, 1].
             symbol_level: (B,) k_d in [0, 1].
@@ -131,9 +139,10 @@ class Denoiser(nn.Module):
         # A clean motion (k_c = 0) is shown at the lowest level of training, whose noise is next to none.
         step = (motion_level * self.num_train_timesteps - 1).clamp(min=0)
         plan, levels = [self.embed_motion(motion)], [self.embed_motion_level(step)]
-        if tokens is not None:
-            one_hot = F.one_hot(tokens, self.vocabulary_size + 1).to(self.embed_symbols.weight.dtype)
-            plan.append(self.embed_symbols(one_hot))
+        if symbols is not None:
+            one_hot = symbols if symbols.is_floating_point() else F.one_hot(symbols, self.symbol_states)
+            plan.append(self.embed_symbols(one_hot.to(self.embed_symbols.weight.dtype)))
+        if self.embeds_symbol_level:
             levels.append(self.embed_symbol_level(symbol_level[:, None]))
 
         condition = torch.cat([torch.stack(levels, dim=1), observation], dim=1) + self.condition_positions
@@ -142,8 +151,8 @@ class Denoiser(nn.Module):
             hidden = self.decoder(torch.cat(plan, dim=1) + self.positions, memory)
 
         motion_prediction = self.motion_head(hidden[:, : self.horizon])
-        logits = self.symbol_head(hidden[:, self.horizon :]) if self.models_symbols else None
-        return Prediction(motion_prediction, logits)
+        symbol_prediction = self.symbol_head(hidden[:, self.horizon :]) if self.models_symbols else None
+        return Prediction(motion_prediction, symbol_prediction)
 
     def parameter_groups(self) -> list[dict]:
         """Parameters with weight decay (matrices of linear layers) and without (the rest), for an optimizer."""

@@ -16,7 +16,7 @@ from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
 from .encoders import StateEncoder
 from .plan import Plan, PlanPrompt
-from .processes import GaussianProcess, MaskedProcess
+from .processes import GaussianProcess, GaussianSymbolProcess, MaskedProcess, SymbolProcess
 from .sampling import DenoisingState, sample_plan
 from .vocabulary import Vocabulary
 
@@ -24,7 +24,7 @@ from .vocabulary import Vocabulary
 class Planner(nn.Module):
     """The network that is trained: the observation's encoder and the denoiser."""
 
-    def __init__(self, config: HDPConfig):
+    def __init__(self, config: HDPConfig, symbol_states: int):
         super().__init__()
         self.encoder = StateEncoder(
             config.input_features, config.observation_token_sizes, config.width, config.observation_weight_std
@@ -34,8 +34,10 @@ class Planner(nn.Module):
             horizon=config.horizon,
             observation_tokens=self.encoder.num_tokens,
             num_train_timesteps=config.num_train_timesteps,
-            vocabulary_size=len(config.vocabulary) if config.plan_symbols else 0,
-            symbolic_horizon=config.symbolic_horizon if config.plan_symbols else 0,
+            vocabulary_size=len(config.vocabulary) if symbol_states else 0,
+            symbolic_horizon=config.symbolic_horizon if symbol_states else 0,
+            symbol_states=symbol_states,
+            shared_level=config.shared_level,
             num_layers=config.num_layers,
             num_heads=config.num_heads,
             width=config.width,
@@ -63,13 +65,10 @@ class HDPPolicy(PreTrainedPolicy):
         config.validate_features()
         if dataset_meta is not None:
             _check_episodes_fit(config, dataset_meta.episodes["length"])
-        self.vocabulary = Vocabulary(config.vocabulary) if config.plan_symbols else None
-        self.motion_process = GaussianProcess(
-            config.num_train_timesteps, config.prediction_type, eta={"ddpm": 1.0, "ddim": 0.0}[config.sampler]
-        )
-        self.symbol_process = MaskedProcess(len(self.vocabulary)) if self.vocabulary else None
+        self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
+        self.motion_process, self.symbol_process = make_processes(config)
 
-        self.planner = Planner(config)
+        self.planner = Planner(config, self.symbol_process.num_states if self.symbol_process else 0)
         self.ema = _moving_average(self.planner, config) if config.ema_max_decay > 0 else None
         if config.compile_model:
             for network in {self.planner, self._planning_network}:
@@ -119,11 +118,11 @@ class HDPPolicy(PreTrainedPolicy):
             loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
             return loss, {"motion_loss": loss.item()}
 
-        k_d = self.symbol_process.sample_level(batch_size, device)
-        masked_symbols = self.symbol_process.corrupt(batch[OBS_SYMBOLIC_PLAN], k_d)
-        prediction = network.denoiser(noisy_motion.value, masked_symbols.value, observation, k_c, k_d)
+        k_d = k_c if self.config.shared_level else self.symbol_process.sample_level(batch_size, device)
+        corrupted_symbols = self.symbol_process.corrupt(batch[OBS_SYMBOLIC_PLAN], k_d)
+        prediction = network.denoiser(noisy_motion.value, corrupted_symbols.value, observation, k_c, k_d)
         motion_loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
-        symbol_loss = self.symbol_process.loss(prediction.logits, masked_symbols).mean()
+        symbol_loss = self.symbol_process.loss(prediction.symbols, corrupted_symbols).mean()
         loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
         return loss, {"motion_loss": motion_loss.item(), "symbol_loss": symbol_loss.item()}
 
@@ -159,10 +158,10 @@ class HDPPolicy(PreTrainedPolicy):
         network = self._planning_network
         observation = network.encoder(batch)
 
-        def denoise(motion: Tensor, tokens: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
+        def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
             with torch.autocast(device.type, torch.bfloat16, enabled=self.config.dtype == "bfloat16"):
-                prediction = network.denoiser(motion, tokens, observation, k_c, k_d)
-            return Prediction(prediction.motion.float(), prediction.logits)
+                prediction = network.denoiser(motion, symbols, observation, k_c, k_d)
+            return Prediction(*(None if part is None else part.float() for part in prediction))
 
         motion, tokens, probabilities = sample_plan(
             denoise,
@@ -172,6 +171,7 @@ class HDPPolicy(PreTrainedPolicy):
             self.config.symbolic_horizon or 0,
             device,
             self.config.num_inference_steps or self.config.num_train_timesteps,
+            self.config.shared_level,
             prompt,
             generator,
             on_step,
@@ -205,7 +205,7 @@ class HDPPolicy(PreTrainedPolicy):
             return
         if prompt.token_ids is not None:
             if self.symbol_process is None:
-                raise ValueError("this planner models no symbols (plan_symbols=false): it takes no symbolic prompt")
+                raise ValueError("this planner models no symbols: it takes no symbolic prompt")
             expected = (motion_shape[0], self.config.symbolic_horizon)
             if tuple(prompt.token_ids.shape) != expected:
                 raise ValueError(f"token_ids must have the shape {expected}, got {tuple(prompt.token_ids.shape)}")
@@ -221,6 +221,19 @@ class HDPPolicy(PreTrainedPolicy):
             raise FileNotFoundError(f"{model_file} is missing from the checkpoint") from error
         except SafetensorError as error:
             raise ValueError(f"{model_file} is damaged or incomplete ({error}); copy the checkpoint again") from error
+
+
+def make_processes(config: HDPConfig) -> tuple[GaussianProcess, SymbolProcess | None]:
+    """The processes of the motion and of the symbols."""
+    gaussian = (config.num_train_timesteps, config.prediction_type, {"ddpm": 1.0, "ddim": 0.0}[config.sampler])
+    motion = GaussianProcess(*gaussian)
+    match config.symbol_process:
+        case "masked":
+            return motion, MaskedProcess(len(config.vocabulary))
+        case "gaussian":
+            return motion, GaussianSymbolProcess(len(config.vocabulary), *gaussian)
+        case _:
+            return motion, None
 
 
 def _moving_average(network: nn.Module, config: HDPConfig) -> AveragedModel:

@@ -49,7 +49,8 @@ class Plan:
         actions: (B, H_c, D) actions, normalised like all that a LeRobot policy returns; its postprocessor
             gives them their units back.
         token_ids: (B, H_d) int64 token ids. None from a planner that models no symbols.
-        token_probabilities: (B, H_d) the probability with which each token was drawn; 1 where it was given.
+        token_probabilities: (B, H_d) the probability with which each token was drawn; 1 where it was given. (B, 0)
+            from a planner that draws none: it models no symbols, or continuous ones.
         vocabulary: what the token ids mean.
     """
 

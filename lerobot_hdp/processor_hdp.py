@@ -70,7 +70,7 @@ def make_hdp_pre_post_processors(
     """LeRobot's default processors, and the symbolic plan as token ids."""
     steps = make_default_policy_processor_steps(config, dataset_stats)
     symbolic_plan = SymbolicPlanProcessorStep(
-        symbolic_horizon=config.symbolic_horizon if config.plan_symbols else None,
+        symbolic_horizon=config.symbolic_horizon if config.symbol_process else None,
         vocabulary_size=len(config.vocabulary or []),
     )
     return make_policy_processor_pipelines(

@@ -9,10 +9,11 @@ from torch import Generator, Tensor
 
 from .denoiser import Prediction
 from .plan import PlanPrompt
-from .processes import GaussianProcess, MaskedProcess, Process
+from .processes import GaussianProcess, MaskedProcess, Process, SymbolProcess
+from .processes.base import expand_to
 
 Denoise = Callable[[Tensor, Tensor | None, Tensor, Tensor], Prediction]
-"""(motion (B, H_c, D), tokens (B, H_d), k_c (B,), k_d (B,)) -> Prediction, for a fixed observation."""
+"""(motion (B, H_c, D), symbols (B, H_d, ...), k_c (B,), k_d (B,)) -> Prediction, for a fixed observation."""
 
 
 class DenoisingState(NamedTuple):
@@ -22,7 +23,7 @@ class DenoisingState(NamedTuple):
         motion: (B, H_c, D) partly denoised motion.
         tokens: (B, H_d) partly unmasked token ids, None where no symbols are modelled.
         token_probabilities: (B, H_d) the probability with which each token was drawn; 1 where given, 0 where masked;
-            (B, 0) where no symbols are modelled.
+            (B, 0) where no tokens are drawn.
     """
 
     motion: Tensor
@@ -38,8 +39,9 @@ class Stream:
         process: the process.
         value: (B, H, ...) where it is.
         levels: (num_steps + 1,) the levels it passes; all 0 where everything is given (k = 0).
-        clean: like `value`, the given part; None: nothing is given.
-        given: broadcastable against `value`, bool, which of `clean` is given.
+        clean: the given part; None: nothing is given.
+        given: broadcastable against `clean`, bool, which of it is given.
+        shared_level: the levels are those of the other process, too, and stay what they are.
     """
 
     process: Process
@@ -47,9 +49,10 @@ class Stream:
     levels: Tensor
     clean: Tensor | None = None
     given: Tensor | None = None
+    shared_level: bool = False
 
     def __post_init__(self):
-        self.all_given = self.given is not None and bool(self.given.all())
+        self.all_given = self.given is not None and bool(self.given.all()) and not self.shared_level
         if self.all_given:
             self.levels = torch.zeros_like(self.levels)
 
@@ -61,7 +64,7 @@ class Stream:
         """Put the given part into the value as it looks before a step."""
         if self.clean is not None and self.given is not None:
             shown = self.process.show_given(self.clean, self.level(step), generator)
-            self.value = torch.where(self.given, shown, self.value)
+            self.value = torch.where(expand_to(self.given, self.value), shown, self.value)
 
     def advance(self, step: int, prediction: Tensor, generator: Generator | None) -> None:
         """Take a reverse step."""
@@ -75,19 +78,21 @@ class Stream:
 def sample_plan(
     denoise: Denoise,
     motion_process: GaussianProcess,
-    symbol_process: MaskedProcess | None,
+    symbol_process: SymbolProcess | None,
     motion_shape: tuple[int, int, int],
     symbolic_horizon: int,
     device: torch.device,
     num_steps: int,
+    shared_level: bool = False,
     prompt: PlanPrompt | None = None,
     generator: Generator | None = None,
     on_step: Callable[[int, DenoisingState], None] | None = None,
 ) -> DenoisingState:
     """Algorithm 2: denoise the motion and unmask the symbols in the same steps, each seeing the other.
 
-    What the prompt gives stays fixed at every step. Given symbols are seen clean; a given action is seen with the
-    noise of the current level, as in training. Where all symbols or the whole motion are given, k_d or k_c is 0.
+    What the prompt gives stays fixed at every step. Given tokens are seen clean; a given action (or one-hot symbol)
+    is seen with the noise of the current level, as in training. Where all symbols or the whole motion are given, k_d
+    or k_c is 0, unless the two share one level.
 
     Args:
         denoise: the denoiser, with its observation.
@@ -96,6 +101,7 @@ def sample_plan(
         symbolic_horizon: H_d.
         device: where the plan is made.
         num_steps: number of calls of the denoiser.
+        shared_level: whether k_d is always k_c.
         prompt: the part of the plan that is given.
         generator: source of all randomness; None: PyTorch's global one.
         on_step: called after each step with its number and the state, and before the first with 0.
@@ -104,7 +110,7 @@ def sample_plan(
 
     def start(process: Process, shape: tuple[int, ...], clean: Tensor | None, given: Tensor | None) -> Stream:
         prior = process.prior(shape, device, generator)
-        stream = Stream(process, prior, process.levels(num_steps).to(device), clean, given)
+        stream = Stream(process, prior, process.levels(num_steps).to(device), clean, given, shared_level)
         stream.set_given(0, generator)
         return stream
 
@@ -116,23 +122,26 @@ def sample_plan(
     k_d = torch.zeros(batch_size, device=device)
     if symbol_process is not None:
         symbols = start(symbol_process, (batch_size, symbolic_horizon), prompt.token_ids, prompt.tokens_mask)
-        tokens = symbols.value
-        probabilities = (tokens != symbol_process.mask_id).float()
+        tokens = symbol_process.tokens(symbols.value)
+        if isinstance(symbol_process, MaskedProcess):
+            probabilities = (tokens != symbol_process.mask_id).float()
 
     if on_step is not None:
         on_step(0, DenoisingState(motion.value, tokens, probabilities))
     for i in range(num_steps):
         if symbols is not None:
             k_d = symbols.level(i)
-        prediction = denoise(motion.value, tokens, motion.level(i), k_d)
+        prediction = denoise(motion.value, symbols.value if symbols else None, motion.level(i), k_d)
         motion.advance(i, prediction.motion, generator)
         if symbols is not None:
-            assert prediction.logits is not None
+            assert symbol_process is not None
+            assert prediction.symbols is not None
             before = symbols.value
-            symbols.advance(i, prediction.logits, generator)
-            drawn = _token_probabilities(prediction.logits, symbols.value)
-            probabilities = torch.where(symbols.value == before, probabilities, drawn)
-            tokens = symbols.value
+            symbols.advance(i, prediction.symbols, generator)
+            tokens = symbol_process.tokens(symbols.value)
+            if isinstance(symbol_process, MaskedProcess):
+                drawn = _token_probabilities(prediction.symbols, tokens)
+                probabilities = torch.where(tokens == before, probabilities, drawn)
         if on_step is not None:
             on_step(i + 1, DenoisingState(motion.value, tokens, probabilities))
     return DenoisingState(motion.value, tokens, probabilities)

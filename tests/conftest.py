@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.parser import get_cli_overrides  # noqa: F401 (imports LeRobot once, before the timers of pytest)
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 
 import lerobot_policy_hdp  # noqa: F401 (registers the policy and the environments)
-from lerobot_hdp import HDPConfig
 
 REPOSITORY = Path(__file__).parents[1]
 N_EPISODES = 30
@@ -58,10 +58,11 @@ def dataset(dataset_root) -> LeRobotDataset:
 
 @pytest.fixture
 def make_planner(dataset):
-    """Build a tiny planner for the dataset: `make_planner(**config) -> policy, preprocessor, postprocessor`."""
+    """Build a tiny planner for the dataset: `make_planner(type, **config) -> policy, preprocessor, postprocessor`."""
 
-    def make(**kwargs):
-        config = HDPConfig(**{**TINY_PLANNER, "device": "cpu", "push_to_hub": False, **kwargs})
+    def make(policy_type="hdp", **kwargs):
+        config_class = PreTrainedConfig.get_choice_class(policy_type)
+        config = config_class(**{**TINY_PLANNER, "device": "cpu", "push_to_hub": False, **kwargs})
         torch.manual_seed(0)
         policy = make_policy(config, ds_meta=dataset.meta)
         return policy, *make_pre_post_processors(config, dataset_stats=dataset.meta.stats)

@@ -111,12 +111,6 @@ def test_a_checkpoint_can_be_fine_tuned(dataset_root, checkpoint, tmp_path):
     torch.testing.assert_close(tuned[name], start[name], atol=0.01, rtol=0)
 
 
-def test_the_motion_alone_can_be_trained(dataset_root, tmp_path):
-    result = train(dataset_root, tmp_path / "diffuser", "--policy.plan_symbols=false", "--steps=2", "--log_freq=1")
-    assert "motion_loss" in result.stderr
-    assert "symbol_loss:" not in result.stderr
-
-
 @pytest.mark.parametrize(
     ("flags", "message"),
     [

@@ -211,17 +211,6 @@ def test_a_smaller_n_action_steps_replans(make_planner, batch):
     assert len(calls) == 3 * policy.config.num_train_timesteps
 
 
-def test_a_planner_without_symbols_is_diffuser(make_planner, batch):
-    policy, preprocessor, _ = make_planner(plan_symbols=False)
-    inputs = preprocessor(batch)
-    loss, parts = policy.train().forward(inputs)
-    assert set(parts) == {"motion_loss"}
-    assert loss.item() == pytest.approx(parts["motion_loss"])
-    plan = policy.eval().plan(inputs)
-    assert plan.token_ids is None
-    assert plan.symbols() == []
-
-
 def test_any_frame_trains_on_what_remains(make_planner, dataset):
     policy, *_ = make_planner(plan_from="any_frame")
     assert policy.config.drop_n_last_frames == 0
@@ -303,15 +292,6 @@ class TestPaperPreset:
     def test_explicit_values_win(self):
         assert HDPConfig(preset="paper", dropout=0.1, device="cpu").dropout == 0.1
 
-    def test_symbols_add_about_one_percent_of_parameters(self, make_planner):
-        """The paper: 'an increase in parameter count by about 1 %'."""
-        sizes = {"num_layers": 8, "num_heads": 4, "width": 256, "preset": "paper", "symbolic_horizon": 108}
-        hybrid, motion_only = (
-            sum(p.numel() for p in make_planner(**sizes, plan_symbols=symbols)[0].planner.parameters())
-            for symbols in (True, False)
-        )
-        assert 0.005 < hybrid / motion_only - 1 < 0.02
-
     def test_plans_are_filled_with_pad(self, make_planner, batch):
         policy, preprocessor, _ = make_planner(symbolic_horizon=108)
         tokens = preprocessor(batch)["observation.symbolic_plan"]
@@ -351,7 +331,7 @@ class TestBadInput:
     def test_a_dataset_without_symbols(self, dataset):
         config = HDPConfig(**TINY_PLANNER, device="cpu")
         features = {k: v for k, v in dataset.meta.features.items() if k != "observation.symbolic_plan"}
-        with pytest.raises(ValueError, match=r"--policy.plan_symbols=false"):
+        with pytest.raises(ValueError, match=r"--policy.type=diffuser"):
             config.set_dataset_feature_metadata(features)
 
     def test_another_vocabulary_than_the_checkpoints(self, dataset):

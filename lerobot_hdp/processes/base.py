@@ -59,6 +59,20 @@ class Process(Protocol):
         ...
 
 
+class SymbolProcess(Process, Protocol):
+    """A process over symbols: its clean data are token ids (B, H_d), its values what the denoiser sees of them.
+
+    Attributes:
+        num_states: size of the vector that stands for a symbol.
+    """
+
+    num_states: int
+
+    def tokens(self, value: Tensor) -> Tensor:
+        """The token ids that a value stands for: (B, H_d)."""
+        ...
+
+
 def expand_to(level: Tensor, value: Tensor) -> Tensor:
     """Give a level of shape (B,) or () trailing axes, so that it broadcasts against a (B, ...) value."""
     return level.reshape(level.shape + (1,) * (value.ndim - level.ndim)) if level.ndim else level

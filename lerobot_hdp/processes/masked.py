@@ -30,6 +30,7 @@ class MaskedProcess:
     def __init__(self, vocabulary_size: int):
         self.vocabulary_size = vocabulary_size
         self.mask_id = vocabulary_size
+        self.num_states = vocabulary_size + 1
 
     def sample_level(self, batch_size: int, device: torch.device) -> Tensor:
         """Low-discrepancy sampling (Kingma et al. 2021): one level in each of B equal parts of (0, 1]."""
@@ -58,6 +59,9 @@ class MaskedProcess:
     def show_given(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Tensor:
         """Clean: in training, too, some symbols are clean at every level below 1."""
         return clean
+
+    def tokens(self, value: Tensor) -> Tensor:
+        return value
 
     def levels(self, num_steps: int) -> Tensor:
         """cos(pi i / 2N): few tokens are revealed at first, many at the end (Chang et al. 2022)."""

@@ -1,0 +1,1 @@
+"""What the paper compares HDP with (its section "Baselines and ablations"), as LeRobot policies of their own."""

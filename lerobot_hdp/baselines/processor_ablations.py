@@ -1,0 +1,7 @@
+"""LeRobot finds a policy's processors by its type and the module of its configuration: they are HDP's."""
+
+from ..processor_hdp import make_hdp_pre_post_processors
+
+make_diffuser_pre_post_processors = make_hdp_pre_post_processors
+make_joint_diffuser_pre_post_processors = make_hdp_pre_post_processors
+make_separate_diffuser_pre_post_processors = make_hdp_pre_post_processors

@@ -1,0 +1,223 @@
+"""The contract that every planner keeps, and what each baseline does differently."""
+
+import pytest
+import torch
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+
+from lerobot_hdp import FREE, PlanPrompt
+
+from .conftest import HORIZON
+
+CONTINUOUS_SYMBOLS = ["joint_diffuser", "separate_diffuser"]
+WITH_SYMBOLS = ["hdp", *CONTINUOUS_SYMBOLS]
+PLANNERS = [*WITH_SYMBOLS, "diffuser"]
+
+
+def observation(batch):
+    return {key: value for key, value in batch.items() if key in ("observation.state", "observation.environment_state")}
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+class TestContract:
+    """`hdp` keeps it too; what is particular to it is tested in test_policy.py."""
+
+    def test_plans_are_of_the_tasks_shape(self, make_planner, batch, planner):
+        policy, preprocessor, postprocessor = make_planner(planner)
+        plan = policy.eval().plan(observation(preprocessor(batch)))
+        assert plan.actions.shape == (4, HORIZON, 3)
+        assert plan.actions.abs().max() <= 1
+        assert postprocessor(plan.actions).shape == plan.actions.shape
+        if planner in WITH_SYMBOLS:
+            assert plan.token_ids.shape == (4, 18)
+            assert plan.token_ids.max() < len(policy.vocabulary)
+            assert all(set(plan.symbols(i)) <= set(policy.vocabulary.symbols) for i in range(4))
+        else:
+            assert plan.token_ids is None
+            assert plan.symbols() == []
+
+    def test_a_generator_determines_the_plan(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = observation(preprocessor(batch))
+        plans = [policy.eval().plan(inputs, generator=torch.Generator().manual_seed(s)).actions for s in (1, 1, 2)]
+        assert torch.equal(plans[0], plans[1])
+        assert not torch.equal(plans[0], plans[2])
+
+    @pytest.mark.parametrize("prediction_type", ["sample", "epsilon"])
+    def test_every_part_of_the_loss_falls(self, make_planner, batch, planner, prediction_type):
+        policy, preprocessor, _ = make_planner(planner, prediction_type=prediction_type)
+        optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+        inputs, history = preprocessor(batch), []
+        policy.train()
+        for _ in range(60):
+            loss, parts = policy.forward(inputs)
+            loss.backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            history.append(parts)
+        for name in history[0]:
+            first, last = (sum(parts[name] for parts in part) for part in (history[:10], history[-10:]))
+            assert last < 0.8 * first
+
+    def test_every_trainable_parameter_gets_a_gradient_and_is_optimised_once(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        policy.train().forward(preprocessor(batch))[0].backward()
+        trainable = [p for p in policy.parameters() if p.requires_grad]
+        assert all(p.grad is not None for p in trainable)
+        optimised = [id(p) for group in policy.get_optim_params() for p in group["params"]]
+        assert sorted(optimised) == sorted(map(id, trainable))
+
+    def test_a_checkpoint_plans_the_same(self, make_planner, batch, planner, tmp_path):
+        policy, preprocessor, postprocessor = make_planner(planner)
+        for part in (policy, preprocessor, postprocessor):
+            part.save_pretrained(tmp_path)
+        loaded = get_policy_class(planner).from_pretrained(tmp_path)
+        loaded_preprocessor, _ = make_pre_post_processors(loaded.config, str(tmp_path))
+        plans = [
+            p.eval().plan(observation(process(batch)), generator=torch.Generator().manual_seed(0))
+            for p, process in ((policy, preprocessor), (loaded, loaded_preprocessor))
+        ]
+        assert torch.equal(plans[0].actions, plans[1].actions)
+        assert plans[0].symbols() == plans[1].symbols()
+
+    def test_the_noise_of_a_training_step_is_in_the_checkpoint(self, make_planner, batch, planner, tmp_path):
+        """So that a resumed run goes on exactly as if never interrupted."""
+        policy, preprocessor, _ = make_planner(planner, dropout=0.5)
+        inputs = preprocessor(batch)
+        policy.train().forward(inputs)
+        policy.save_pretrained(tmp_path)
+        resumed = get_policy_class(planner).from_pretrained(tmp_path).train()
+        torch.rand(3)
+        assert policy.forward(inputs)[0].item() == resumed.forward(inputs)[0].item()
+
+    def test_select_action_plays_the_plan(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = observation(preprocessor(batch))
+        policy.eval().reset()
+        torch.manual_seed(3)
+        plan = policy.plan(inputs).actions
+        torch.manual_seed(3)
+        played = torch.stack([policy.select_action(inputs) for _ in range(HORIZON)], dim=1)
+        assert torch.equal(played, plan)
+
+    def test_the_beginning_of_the_motion_can_be_given(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = preprocessor(batch)
+        given = torch.zeros(4, HORIZON, dtype=torch.bool)
+        given[:, :7] = True
+        plan = policy.eval().plan(observation(inputs), PlanPrompt(actions=inputs["action"], actions_given=given))
+        assert torch.equal(plan.actions[:, :7], inputs["action"][:, :7])
+        assert not torch.equal(plan.actions[:, 7:], inputs["action"][:, 7:])
+
+    def test_bfloat16_can_be_switched_on(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner, dtype="bfloat16")
+        inputs = preprocessor(batch)
+        with torch.autocast("cpu", torch.bfloat16):
+            loss, _ = policy.train().forward(inputs)
+        loss.backward()
+        assert torch.isfinite(loss)
+        assert policy.eval().plan(observation(inputs)).actions.dtype == torch.float32
+
+    def test_nan_in_an_observation_is_refused(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = observation(preprocessor(batch))
+        inputs["observation.state"][2, 0] = torch.nan
+        with pytest.raises(ValueError, match=r"observation.state holds NaN or infinity"):
+            policy.eval().plan(inputs)
+
+
+@pytest.mark.parametrize("planner", CONTINUOUS_SYMBOLS)
+class TestContinuousSymbols:
+    def test_given_symbols_stay_fixed_in_every_step_but_for_their_noise(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        token_ids = policy.vocabulary.encode_prompt("PICK _ S1 PLACE", 18).expand(4, -1)
+        states = []
+        prompt = PlanPrompt(token_ids=token_ids)
+        inputs = observation(preprocessor(batch))
+        plan = policy.eval().plan(inputs, prompt, on_step=lambda _, state: states.append(state))
+        given = token_ids != FREE
+        assert len(states) == 11
+        assert torch.equal(plan.token_ids[given], token_ids[given])
+        assert not torch.equal(states[0].tokens[given], token_ids[given])
+        free = policy.plan(inputs, generator=torch.Generator().manual_seed(0)).token_ids
+        assert not torch.equal(free[given], token_ids[given])
+
+    def test_with_all_symbols_given_they_are_kept(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = preprocessor(batch)
+        tokens = inputs["observation.symbolic_plan"]
+        plan = policy.eval().plan(observation(inputs), PlanPrompt(token_ids=tokens))
+        assert torch.equal(plan.token_ids, tokens)
+
+    def test_no_token_has_a_probability(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        assert policy.eval().plan(observation(preprocessor(batch))).token_probabilities.shape == (4, 0)
+
+
+class TestLevels:
+    """What the denoiser is told about k_c and k_d."""
+
+    @staticmethod
+    def levels_in(run, network):
+        seen = []
+        handle = network.denoiser.register_forward_pre_hook(
+            lambda _, arguments: seen.append(torch.stack(arguments[3:5]).clone())
+        )
+        run()
+        handle.remove()
+        return torch.cat(seen, dim=1)
+
+    @pytest.mark.parametrize(("planner", "shared"), [("joint_diffuser", True), ("separate_diffuser", False)])
+    def test_in_training(self, make_planner, batch, planner, shared):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = preprocessor(batch)
+        k_c, k_d = self.levels_in(lambda: [policy.train().forward(inputs) for _ in range(4)], policy.planner)
+        assert torch.equal(k_c, k_d) == shared
+
+    @pytest.mark.parametrize("planner", CONTINUOUS_SYMBOLS)
+    def test_in_planning_both_fall_together(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = observation(preprocessor(batch))
+        k_c, k_d = self.levels_in(lambda: policy.eval().plan(inputs), policy._planning_network)
+        assert torch.equal(k_c, k_d)
+        assert torch.allclose(k_c[::4], torch.arange(10, 0, -1) / 10)
+
+    @pytest.mark.parametrize(("planner", "lowest"), [("joint_diffuser", 0.1), ("separate_diffuser", 0.0)])
+    def test_with_all_symbols_given_only_a_level_of_their_own_is_zero(self, make_planner, batch, planner, lowest):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = preprocessor(batch)
+        prompt = PlanPrompt(token_ids=inputs["observation.symbolic_plan"])
+        k_c, k_d = self.levels_in(lambda: policy.eval().plan(observation(inputs), prompt), policy._planning_network)
+        assert k_c.max() == 1
+        assert k_d.min() == pytest.approx(lowest)
+        assert k_d.max() == (1 if planner == "joint_diffuser" else 0)
+
+    def test_joint_has_no_embedding_of_a_second_level(self, make_planner):
+        names = {type_: set(make_planner(type_)[0].state_dict()) for type_ in CONTINUOUS_SYMBOLS}
+        extra = names["separate_diffuser"] - names["joint_diffuser"]
+        assert extra
+        assert all("embed_symbol_level" in name for name in extra)
+
+
+class TestDiffuser:
+    def test_needs_no_symbols(self, dataset, make_planner, batch):
+        config = make_planner("diffuser")[0].config
+        assert config.vocabulary is None
+        features = {k: v for k, v in dataset.meta.features.items() if k != "observation.symbolic_plan"}
+        config.set_dataset_feature_metadata(features)
+        config.validate_features()
+
+    def test_takes_no_symbolic_prompt(self, make_planner, batch):
+        policy, preprocessor, _ = make_planner("diffuser")
+        prompt = PlanPrompt(token_ids=torch.zeros(4, 18, dtype=torch.int64))
+        with pytest.raises(ValueError, match="models no symbols"):
+            policy.eval().plan(observation(preprocessor(batch)), prompt)
+
+    def test_hdp_adds_about_one_percent_of_parameters_to_it(self, make_planner):
+        """The paper: 'an increase in parameter count by about 1 %'."""
+        sizes = {"num_layers": 8, "num_heads": 4, "width": 256, "preset": "paper"}
+        hybrid, motion_only = (
+            sum(p.numel() for p in make_planner(planner, **sizes, symbolic_horizon=108)[0].planner.parameters())
+            for planner in ("hdp", "diffuser")
+        )
+        assert 0.005 < hybrid / motion_only - 1 < 0.02
