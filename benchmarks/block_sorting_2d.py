@@ -1,15 +1,14 @@
-"""Train on 2D sorting with LeRobot's own commands and evaluate fresh starts: HDP, and the motion alone beside it.
+"""Train on 2D sorting and evaluate fresh starts: HDP, and the motion alone beside it.
 
     python -m benchmarks.block_sorting_2d --n_blocks=3
 
-Records the dataset if it is not there, runs `lerobot-train --config_path=configs/block_sorting_2d_<n>_blocks.json` and
+Records the dataset if it is not there, runs `hdp-train --config_path=configs/block_sorting_2d_<n>_blocks.json` and
 `lerobot-eval`, and writes `benchmarks/results/block_sorting_2d_<n>_blocks_<planner>.json`.
 """
 
 import argparse
 import json
 import math
-import os
 import subprocess
 import sys
 import time
@@ -22,13 +21,9 @@ OUTPUTS = Path("outputs/benchmarks")
 
 
 def run(command: str, *arguments: str) -> float:
-    """Run an installed command and return how long it took, in seconds.
-
-    With one thread a process: on 2 cores, a second thread would only fight with the data loader's worker.
-    """
+    """Run an installed command and return how long it took, in seconds."""
     start = time.perf_counter()
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    subprocess.run([Path(sys.executable).with_name(command), *arguments], check=True, env=environment)
+    subprocess.run([Path(sys.executable).with_name(command), *arguments], check=True)
     return time.perf_counter() - start
 
 
@@ -55,7 +50,7 @@ def measure(planner: str, n_blocks: int, episodes: int, seed: int) -> dict[str, 
         )
     output = OUTPUTS / f"block_sorting_2d_{n_blocks}_blocks_{planner}_seed{seed}"
     train_s = run(
-        "lerobot-train",
+        "hdp-train",
         f"--config_path={config}",
         f"--policy.type={planner}",
         f"--output_dir={output}",

@@ -15,17 +15,20 @@ OBS_SYMBOLIC_PLAN = f"{OBS_PREFIX}symbolic_plan"
 """Dataset column with the plan's token ids; from an environment, the plan's prompt. It has this name because LeRobot
 keeps only `observation.*` columns."""
 
+SAMPLERS = ["ddpm", "ddim", "confidence"]
+
 PRESETS: dict[str, dict[str, Any]] = {
     # What measures best.
     "default": {
         "prediction_type": "sample",
         "dropout": 0.0,
         "object_tokens": True,
-        "normalise_condition": True,
         "observation_weight_std": 0.5,
         "symbol_loss_weight": 1 / 300,
         "optimizer_lr": 1e-3,
         "scheduler_warmup_steps": 100,
+        "sampler": "confidence",
+        "num_inference_steps": 10,
     },
     # The paper's values (Table "Transformer architecture hyperparameters" and those of Diffusion Policy, on which
     # it builds). Its symbolic horizon is longer than a plan needs: set `symbolic_horizon` to the table's H_d.
@@ -33,11 +36,12 @@ PRESETS: dict[str, dict[str, Any]] = {
         "prediction_type": "epsilon",
         "dropout": 0.3,
         "object_tokens": False,
-        "normalise_condition": False,
         "observation_weight_std": 0.02,
         "symbol_loss_weight": 1 / 30,
         "optimizer_lr": 1e-4,
         "scheduler_warmup_steps": 1000,
+        "sampler": "ddpm",
+        "num_inference_steps": 100,
     },
 }
 """Values of the fields that are None until a preset fills them."""
@@ -66,9 +70,8 @@ class HDPConfig(PreTrainedConfig):
         object_tokens: True makes a condition token of each object in `observation.environment_state` (its components
             are named `object.component` in the dataset) and one of each other observation; False makes one of all.
         observation_token_sizes: how many numbers become each condition token; follows from the dataset.
-        normalise_condition, observation_weight_std: whether the condition tokens are normalised before the transformer
-            attends to them, and the size of the initial weights that make them of the observations. Small weights
-            without normalisation are Diffusion Policy's; with them, fine differences in position are learned late.
+        observation_weight_std: size of the initial weights that make condition tokens of the observations. Small ones
+            are Diffusion Policy's; with them, fine differences in position are learned late.
         num_train_timesteps: N, steps of the Gaussian process.
         prediction_type: what is predicted of the motion: `epsilon` (the noise), `sample` (the clean motion) or
             `v_prediction`.
@@ -77,8 +80,11 @@ class HDPConfig(PreTrainedConfig):
         ema_power, ema_max_decay: the weights that plan are an exponential moving average with the decay
             min(1 - (1 + update)^-ema_power, ema_max_decay), as in Diffusion Policy. `ema_max_decay` 0 switches it off.
 
-        sampler: `ddpm` draws noise in every step, `ddim` only at the start.
-        num_inference_steps: network calls for a plan. None: N.
+        sampler: how a plan is drawn. `ddpm` is the paper's: noise in every step of the motion, symbols revealed at
+            random. `ddim` draws the motion's noise at the start only. `confidence` does so too, and reveals symbols as
+            soon as the planner is sure of them, which needs far fewer steps.
+        confidence_threshold: how probable a symbol must be for the `confidence` sampler to reveal it.
+        num_inference_steps: network calls for a plan.
 
         compile_model, compile_mode: run the denoiser through `torch.compile`.
         dtype: `float32`, or `bfloat16` for autocast in training and planning.
@@ -109,7 +115,6 @@ class HDPConfig(PreTrainedConfig):
     dropout: float | None = None
     object_tokens: bool | None = None
     observation_token_sizes: list[int] | None = None
-    normalise_condition: bool | None = None
     observation_weight_std: float | None = None
     num_train_timesteps: int = 100
     prediction_type: str | None = None
@@ -117,7 +122,8 @@ class HDPConfig(PreTrainedConfig):
     ema_power: float = 0.75
     ema_max_decay: float = 0.9999
 
-    sampler: str = "ddpm"
+    sampler: str | None = None
+    confidence_threshold: float = 0.8
     num_inference_steps: int | None = None
 
     compile_model: bool = False
@@ -148,7 +154,7 @@ class HDPConfig(PreTrainedConfig):
                 setattr(self, name, value)
         _check_choice("plan_from", self.plan_from, ["episode_start", "any_frame"])
         _check_choice("prediction_type", self.prediction_type, ["epsilon", "sample", "v_prediction"])
-        _check_choice("sampler", self.sampler, ["ddpm", "ddim"])
+        _check_choice("sampler", self.sampler, SAMPLERS)
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")

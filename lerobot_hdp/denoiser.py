@@ -38,25 +38,6 @@ class SinusoidalEmbedding(nn.Module):
         return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
-class ConditionEncoder(nn.Module):
-    """Two linear layers over each condition token, as in Diffusion Policy: (B, n, width) -> (B, n, width).
-
-    Args:
-        width: size of a token.
-        normalise: add the input to the output and normalise the sum. The decoder does not normalise what it attends to,
-            and weights that start small make an observation so faint that it is learned late.
-    """
-
-    def __init__(self, width: int, normalise: bool):
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        self.norm = nn.LayerNorm(width) if normalise else None
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        encoded = self.layers(tokens)
-        return encoded if self.norm is None else self.norm(tokens + encoded)
-
-
 class Denoiser(nn.Module):
     """(motion prediction, symbol prediction) = D_theta(A_c, A_d, O, k_c, k_d).
 
@@ -74,8 +55,6 @@ class Denoiser(nn.Module):
         symbol_states: size of the vector that stands for a symbol.
         shared_level: k_d is always k_c, so that only the latter is a condition.
         num_layers, num_heads, width, dropout: of the transformer. Dropout acts in attention and feed-forward layers.
-        normalise_condition: make the condition tokens of a size that attention can read from the first step on; False
-            leaves them as small as Diffusion Policy's initialisation makes them.
     """
 
     def __init__(
@@ -92,7 +71,6 @@ class Denoiser(nn.Module):
         num_heads: int,
         width: int,
         dropout: float,
-        normalise_condition: bool,
     ):
         super().__init__()
         self.horizon = horizon
@@ -114,7 +92,7 @@ class Denoiser(nn.Module):
 
         condition_tokens = 1 + int(self.embeds_symbol_level) + observation_tokens
         self.condition_positions = nn.Parameter(torch.empty(1, condition_tokens, width))
-        self.condition_encoder = ConditionEncoder(width, normalise_condition)
+        self.condition_encoder = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         layer = nn.TransformerDecoderLayer(
             width, num_heads, 4 * width, dropout, activation="gelu", batch_first=True, norm_first=True
         )

@@ -42,7 +42,6 @@ class Planner(nn.Module):
             num_heads=config.num_heads,
             width=config.width,
             dropout=config.dropout,
-            normalise_condition=config.normalise_condition,
         )
 
 
@@ -170,7 +169,7 @@ class HDPPolicy(PreTrainedPolicy):
             motion_shape,
             self.config.symbolic_horizon or 0,
             device,
-            self.config.num_inference_steps or self.config.num_train_timesteps,
+            self.config.num_inference_steps,
             self.config.shared_level,
             prompt,
             generator,
@@ -225,11 +224,12 @@ class HDPPolicy(PreTrainedPolicy):
 
 def make_processes(config: HDPConfig) -> tuple[GaussianProcess, SymbolProcess | None]:
     """The processes of the motion and of the symbols."""
-    gaussian = (config.num_train_timesteps, config.prediction_type, {"ddpm": 1.0, "ddim": 0.0}[config.sampler])
+    gaussian = (config.num_train_timesteps, config.prediction_type, 1.0 if config.sampler == "ddpm" else 0.0)
     motion = GaussianProcess(*gaussian)
     match config.symbol_process:
         case "masked":
-            return motion, MaskedProcess(len(config.vocabulary))
+            threshold = config.confidence_threshold if config.sampler == "confidence" else None
+            return motion, MaskedProcess(len(config.vocabulary), threshold)
         case "gaussian":
             return motion, GaussianSymbolProcess(len(config.vocabulary), *gaussian)
         case _:

@@ -57,8 +57,8 @@ class Stream:
             self.levels = torch.zeros_like(self.levels)
 
     def level(self, step: int) -> Tensor:
-        """The level before a step, for each sample: (B,)."""
-        return self.levels[step].expand(len(self.value))
+        """The level before a step, as the denoiser is told of it: (B,)."""
+        return self.process.told_level(self.value, self.levels[step])
 
     def set_given(self, step: int, generator: Generator | None) -> None:
         """Put the given part into the value as it looks before a step."""

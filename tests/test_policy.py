@@ -39,23 +39,6 @@ def test_a_plan_depends_on_every_observation(make_planner, batch, object_tokens)
             assert not torch.equal(encoder(changed), encoder(inputs))
 
 
-def test_normalised_condition_tokens_are_seen_from_the_first_step_on(make_planner, batch):
-    def change_of_prediction(normalise_condition):
-        policy, preprocessor, _ = make_planner(normalise_condition=normalise_condition)
-        inputs = preprocessor(batch)
-        motion, tokens = inputs["action"], inputs["observation.symbolic_plan"]
-        level = torch.full((len(motion),), 0.5)
-        shifted = {key: value + 0.2 for key, value in observation(inputs).items()}
-        planner = policy.eval().planner
-        before, after = (
-            planner.denoiser(motion, tokens, planner.encoder(seen), level, level).motion
-            for seen in (observation(inputs), shifted)
-        )
-        return (after - before).std() / before.std()
-
-    assert change_of_prediction(True) > 3 * change_of_prediction(False)
-
-
 def test_tokens_survive_from_the_dataset_to_the_model_and_back_to_words(make_planner, batch, dataset):
     policy, preprocessor, _ = make_planner()
     tokens = preprocessor(batch)["observation.symbolic_plan"]
@@ -111,7 +94,7 @@ def test_a_plan_is_whole_and_holds_no_mask(make_planner, batch):
     assert postprocessor(plan.actions).shape == plan.actions.shape
 
 
-@pytest.mark.parametrize("sampler", ["ddpm", "ddim"])
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "confidence"])
 @pytest.mark.parametrize("num_inference_steps", [1, 4, 10])
 def test_the_number_of_network_calls_is_the_users_choice(make_planner, batch, sampler, num_inference_steps):
     policy, preprocessor, _ = make_planner(sampler=sampler, num_inference_steps=num_inference_steps)

@@ -134,9 +134,38 @@ class TestMaskedProcess:
         drawn = process.reverse_step(value, torch.randn(1, 3, 4), torch.tensor(0.5), torch.tensor(0.1))
         assert drawn[0, :2].tolist() == [0, 3]
 
+    def test_with_a_threshold_sure_tokens_are_revealed_and_the_surest_in_any_case(self):
+        process = MaskedProcess(vocabulary_size=2, confidence_threshold=0.9)
+        mask = process.mask_id
+        value = torch.tensor([[mask, mask, mask, 0], [mask, mask, mask, mask]])
+        probability_of_0 = torch.tensor([[1.0, 0.6, 0.95, 0.5], [0.5, 0.6, 0.5, 0.9]])
+        prediction = torch.stack([probability_of_0, 1 - probability_of_0], dim=-1).log()
+        draws = torch.stack(
+            [
+                process.reverse_step(value, prediction, torch.tensor(0.9), torch.tensor(0.8), generator(i))
+                for i in range(300)
+            ]
+        )
+        revealed = draws != mask
+        assert (revealed.sum(dim=-1) >= (value != mask).sum(dim=-1) + 1).all()  # at least one more
+        assert revealed[:, 0, 0].all()
+        assert not revealed[:, 0, 1].any()
+        # A token is as sure as the value that was drawn for it.
+        assert revealed[:, 0, 2].float().mean() == pytest.approx(0.95, abs=0.04)
+        assert (draws[:, 0, 2][revealed[:, 0, 2]] == 0).all()
+        last = process.reverse_step(value, prediction, torch.tensor(0.9), torch.tensor(0.0), generator())
+        assert last.max() < mask
+
+    def test_with_a_threshold_the_denoiser_is_told_the_fraction_of_masks(self):
+        value = torch.tensor([[2, 2, 0, 1], [0, 1, 1, 0]])
+        levels = MaskedProcess(vocabulary_size=2, confidence_threshold=0.9).told_level(value, torch.tensor(0.7))
+        assert levels.tolist() == [0.5, 0.0]
+        assert MaskedProcess(vocabulary_size=2).told_level(value, torch.tensor(0.5)).tolist() == [0.5, 0.5]
+
+    @pytest.mark.parametrize("confidence_threshold", [None, 0.8])
     @pytest.mark.parametrize("num_steps", [1, 10, 100])
-    def test_a_fully_masked_start_ends_without_a_mask(self, num_steps):
-        process = MaskedProcess(vocabulary_size=4)
+    def test_a_fully_masked_start_ends_without_a_mask(self, num_steps, confidence_threshold):
+        process = MaskedProcess(4, confidence_threshold)
         levels = process.levels(num_steps)
         value = process.prior((64, 30), torch.device("cpu"))
         for level, next_level in pairwise(levels):

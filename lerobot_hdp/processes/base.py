@@ -52,6 +52,14 @@ class Process(Protocol):
         """The levels of a way back in `num_steps` steps, from 1 down to 0: (num_steps + 1,)."""
         ...
 
+    def told_level(self, value: Tensor, level: Tensor) -> Tensor:
+        """The level that the denoiser is told for a value on its way back: (B,).
+
+        Args:
+            level: the scheduled one, a scalar.
+        """
+        ...
+
     def reverse_step(
         self, value: Tensor, prediction: Tensor, level: Tensor, next_level: Tensor, generator: Generator | None = None
     ) -> Tensor:

@@ -88,6 +88,9 @@ class GaussianProcess:
         steps = torch.linspace(self.num_train_timesteps, 0, num_steps + 1).round()
         return steps / self.num_train_timesteps
 
+    def told_level(self, value: Tensor, level: Tensor) -> Tensor:
+        return level.expand(len(value))
+
     def predicted_sample(self, value: Tensor, prediction: Tensor, level: Tensor) -> Tensor:
         """The clean motion that a prediction stands for, clipped to [-1, 1]: like `value`."""
         signal, scale = self._signal_and_noise_scale(level, value)

@@ -6,6 +6,10 @@ Each token is masked independently with probability k, so that alpha(k) = 1 - k:
     Eq. 5   L = sum over masked positions of w(k) cross_entropy, with w(k) = -alpha'(k) / (1 - alpha(k)) = 1 / k
     Eq. 6   p(A^s | A^k): a masked token is revealed with probability gamma = (alpha(s) - alpha(k)) / (1 - alpha(k))
             = (k - s) / k, its value drawn from the predicted categorical; what is revealed stays
+
+Eq. 6 draws the tokens of one step independently of each other, so that few steps make plans that contradict themselves.
+With a confidence threshold, a step reveals only what follows from what is there already: tokens whose drawn value is
+more probable than the threshold, and the surest one in any case (parallel decoding of Wu et al. 2025, "Fast-dLLM").
 """
 
 import math
@@ -25,9 +29,11 @@ class MaskedProcess:
 
     Args:
         vocabulary_size: m, the number of symbols; the mask e_m has the id m.
+        confidence_threshold: reveal tokens by their probability; None: by Eq. 6.
     """
 
-    def __init__(self, vocabulary_size: int):
+    def __init__(self, vocabulary_size: int, confidence_threshold: float | None = None):
+        self.confidence_threshold = confidence_threshold
         self.vocabulary_size = vocabulary_size
         self.mask_id = vocabulary_size
         self.num_states = vocabulary_size + 1
@@ -69,13 +75,29 @@ class MaskedProcess:
         levels[-1] = 0.0
         return levels
 
+    def told_level(self, value: Tensor, level: Tensor) -> Tensor:
+        """The scheduled level; with a confidence threshold, the fraction of tokens that are still masked."""
+        if self.confidence_threshold is None:
+            return level.expand(len(value))
+        return (value == self.mask_id).float().mean(dim=1)
+
     def reverse_step(
         self, value: Tensor, prediction: Tensor, level: Tensor, next_level: Tensor, generator: Generator | None = None
     ) -> Tensor:
-        """Eq. 6."""
-        reveal_probability = (level - next_level) / level
-        uniform = torch.rand(value.shape, device=value.device, generator=generator)
-        revealed = (value == self.mask_id) & (uniform < reveal_probability)
-        probabilities = prediction.float().softmax(dim=-1).flatten(0, -2)
-        drawn = torch.multinomial(probabilities, 1, generator=generator).reshape(value.shape)
+        """Eq. 6, or by confidence; then the levels count only in that level 0 reveals everything."""
+        probabilities = prediction.float().softmax(dim=-1)
+        masked = value == self.mask_id
+        if self.confidence_threshold is None:
+            uniform = torch.rand(value.shape, device=value.device, generator=generator)
+            drawn = _draw(probabilities, generator)
+            return torch.where(masked & (uniform < (level - next_level) / level), drawn, value)
+        drawn = _draw(probabilities, generator)
+        confidence = probabilities.gather(-1, drawn[..., None]).squeeze(-1).masked_fill(~masked, -1.0)
+        surest = confidence == confidence.amax(dim=1, keepdim=True)
+        revealed = masked & (surest | (confidence > self.confidence_threshold) | (next_level == 0))
         return torch.where(revealed, drawn, value)
+
+
+def _draw(probabilities: Tensor, generator: Generator | None) -> Tensor:
+    """A token from each categorical distribution: (B, H, m) -> (B, H)."""
+    return torch.multinomial(probabilities.flatten(0, -2), 1, generator=generator).reshape(probabilities.shape[:-1])
