@@ -16,8 +16,9 @@ PAGES = {
 HEADING = "## Measured\n"
 
 
-COUPLED_SEEDS = """These runs seeded the expert like the start, so that its choices followed from it; the script since gives it a seed of its
-own, and the runs are to be repeated.
+COUPLED_SEEDS = """\
+These runs seeded the expert like the start, so that its choices followed from it; the script since gives it
+a seed of its own, and the runs are to be repeated.
 """
 
 

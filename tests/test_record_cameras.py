@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from draccus.utils import ParsingError
 from lerobot.datasets.language_render import active_at
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.utils import env_to_policy_features
@@ -84,12 +85,13 @@ def test_neither_the_number_of_processes_nor_an_interruption_changes_a_frame(tmp
             raise KeyboardInterrupt
         return expert(env, rng)
 
-    resumed = config(tmp_path / "interrupted", ARRANGE, num_episodes=4)
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setitem(EXPERTS, ARRANGE.gym_id, interrupted)
-        record(resumed)
-    resumed.resume = True
-    resumed = record(resumed)
+    monkeypatch.setitem(EXPERTS, ARRANGE.gym_id, interrupted)
+    settings = config(tmp_path / "interrupted", ARRANGE, num_episodes=4)
+    with pytest.raises(KeyboardInterrupt):
+        record(settings)
+    monkeypatch.setitem(EXPERTS, ARRANGE.gym_id, expert)
+    settings.resume = True
+    resumed = record(settings)
     assert len(whole) == len(resumed) == 4 * ARRANGE.planning_task.horizon
     for one, other in zip(whole, resumed, strict=True):
         assert one.keys() == other.keys()
@@ -103,7 +105,8 @@ def test_replaying_the_actions_from_the_seed_gives_the_recorded_score(dataset, t
         dataset = record(config(tmp_path / "state", HDPEnv(task=ARRANGE.task), num_episodes=3))
     recording = load_recording(dataset)
     assert replay(recording) == recording.scores.tolist() == [1.0] * dataset.num_episodes
-    assert replay(recording._replace(plans=recording.plans[:, ::-1])) != recording.scores.tolist()
+    never_open = recording._replace(plans=recording.plans * [1, 1, 1, 0])
+    assert max(replay(never_open)) < 1.0
 
 
 def test_language_columns_say_which_step_is_being_done(dataset):
@@ -121,17 +124,13 @@ def test_language_columns_say_which_step_is_being_done(dataset):
             assert frame["language_events"] == []
 
 
-def test_bad_camera_flags_are_one_line_and_leave_nothing_behind(tmp_path):
-    flags = ("--dataset.repo_id=t/t", f"--dataset.root={tmp_path / 'nothing'}")
-    for more, message in (
-        (("--env.obs_type=pixels",), "--env.obs_type of BlockSorting2D-v0 must be one of ('state',)"),
-        (("--env.task=XArmSorting-v0", "--env.obs_type=pixels", "--env.camera_height=0"), "at least 1 pixel"),
-    ):
-        result = run_command("hdp-record", *flags, *more, check=False)
-        assert result.returncode != 0
-        assert message in result.stderr.splitlines()[-1]
-        assert "Traceback" not in result.stderr
-        assert list(tmp_path.iterdir()) == []
+def test_cameras_that_a_task_cannot_have_are_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ParsingError, match="must be one of"):
+        HDPEnv(task="BlockSorting2D-v0", obs_type="pixels")
+    without_pixels = HDPEnv(task="XArmSorting-v0", obs_type="pixels", camera_height=0)
+    with pytest.raises(ValueError, match="at least 1 pixel"):
+        record(config(tmp_path / "nothing", without_pixels))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(find_spec("diffusers") is None, reason="needs lerobot[diffusion]")
