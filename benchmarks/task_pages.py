@@ -36,7 +36,8 @@ def expert_table(task: str) -> str:
     rows = {
         "successes": f'{successes(own)}; with `robot="menagerie"` {successes(menagerie)}',
         "clipped actions": own["clipped_actions"],
-        "plans": f"{len(counts)} different ones, each chosen {min(counts)} to {max(counts)} times",
+        "plans": f"{len(counts)} different ones, each chosen {min(counts)} to {max(counts)} times "
+        f"([counts](../../benchmarks/results/expert_{task}.json))",
         "episodes per second, one process": f"{own['episodes_per_second']:.1f}",
         "time inside `mj_step`": f"{own['physics_fraction']:.0%}",
     }

@@ -27,8 +27,13 @@ def write_language_columns(root: Path, vocabulary: Sequence[str]) -> None:
     Args:
         root: folder of the dataset.
         vocabulary: the symbols, in the order of their ids.
+
+    Raises:
+        ValueError: the dataset has language columns already.
     """
     info = load_info(root)
+    if LANGUAGE_PERSISTENT in info.features:
+        raise ValueError(f"{root} has language columns already")
     info.features = {**info.features, **language_feature_info()}
     features = get_hf_features_from_features(info.features)
     language_features = datasets.Features({key: features[key] for key in (LANGUAGE_PERSISTENT, LANGUAGE_EVENTS)})
@@ -46,7 +51,9 @@ def write_language_columns(root: Path, vocabulary: Sequence[str]) -> None:
         for name in columns.column_names:
             table = table.append_column(columns.field(name), columns[name])
         table = table.replace_schema_metadata(features.arrow_schema.metadata)
-        write_table_one_row_group_per_episode(table, path)
+        unfinished = path.with_suffix(".unfinished")
+        write_table_one_row_group_per_episode(table, unfinished)
+        unfinished.replace(path)
     write_info(info, root)
 
 

@@ -17,6 +17,7 @@ from benchmarks.replay import load_recording, replay
 from dataset_tools import record as recorder
 from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
+from dataset_tools.language import write_language_columns
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, episode_seed, record
 from gym_hdp_tasks.env_config import HDPEnv
 
@@ -65,8 +66,10 @@ def test_a_video_shows_what_the_environment_showed(dataset):
 
 
 def test_images_can_be_kept_without_loss(tmp_path):
-    dataset = record(config(tmp_path / "images", ARRANGE, num_episodes=1, video=False))
-    env = gym.make(ARRANGE.gym_id, disable_env_checker=True, **ARRANGE.gym_kwargs)
+    pixels = HDPEnv(task=ARRANGE.task, obs_type="pixels", camera_height=32, camera_width=48)
+    dataset = record(config(tmp_path / "images", pixels, num_episodes=1, video=False))
+    assert not {"observation.state", "observation.environment_state"} & set(dataset.features)
+    env = gym.make(pixels.gym_id, disable_env_checker=True, **pixels.gym_kwargs)
     observation, _ = env.reset(seed=episode_seed(0, 0))
     for name in IMAGES:
         shown = observation["pixels"][name.rsplit(".", 1)[1]].transpose(2, 0, 1)
@@ -122,6 +125,8 @@ def test_language_columns_say_which_step_is_being_done(dataset):
             plan = active_at(time, persistent=rows, style="plan")["content"]
             assert [line.split(". ")[-1] for line in plan.splitlines()] == left
             assert frame["language_events"] == []
+    with pytest.raises(ValueError, match="already"):
+        write_language_columns(dataset.root, SORTING.planning_task.vocabulary)
 
 
 def test_cameras_that_a_task_cannot_have_are_refused_before_anything_is_written(tmp_path):
