@@ -2,7 +2,8 @@
 
 python -m benchmarks.experts --num_episodes 1000
 
-Writes one JSON file for each task to `benchmarks/results/`. `physics_fraction` is the share of the time of resets,
+Writes one JSON file for each task to `benchmarks/results/`; a task whose file is there with as many episodes is not run
+again, without `--overwrite`. `physics_fraction` is the share of the time of resets,
 experts and steps together that is spent inside `mj_step`.
 """
 
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import mujoco
+from tqdm import trange
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from dataset_tools.demonstration import expert_generator
@@ -42,10 +44,11 @@ class TimedPhysics:
 def measure(gym_id: str, num_episodes: int, robot: str) -> dict:
     """Let the expert demonstrate the seeds 0, 1, ... and count."""
     env = gym.make(gym_id, robot=robot, disable_env_checker=True)
+    mj_step = mujoco.mj_step
     mujoco.mj_step = physics = TimedPhysics()
     failures, clipped, plans = {}, 0, Counter()
     start = time.perf_counter()
-    for seed in range(num_episodes):
+    for seed in trange(num_episodes, desc=gym_id, mininterval=10):
         env.reset(seed=seed)
         demonstration = EXPERTS[gym_id](env, expert_generator(seed))
         for action in demonstration.waypoints:
@@ -55,6 +58,7 @@ def measure(gym_id: str, num_episodes: int, robot: str) -> dict:
         if not info["is_success"]:
             failures[seed] = score
     seconds = time.perf_counter() - start
+    mujoco.mj_step = mj_step
     return {
         "task": gym_id,
         "robot": robot,
@@ -69,19 +73,30 @@ def measure(gym_id: str, num_episodes: int, robot: str) -> dict:
     }
 
 
+def is_finished(path: Path, num_episodes: int) -> bool:
+    """Whether a results file holds that many episodes, and says where they come from."""
+    result = json.loads(path.read_text()) if path.exists() else {}
+    return "run" in result and result["num_episodes"] == num_episodes
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num_episodes", type=int, default=1000)
     parser.add_argument("--tasks", nargs="+", choices=XARM_TASKS, default=XARM_TASKS)
     parser.add_argument("--robot", default="primitive")
+    parser.add_argument("--overwrite", action="store_true", help="measure finished tasks again")
     options = parser.parse_args()
     for gym_id in options.tasks:
-        result = measure(gym_id, options.num_episodes, options.robot)
-        result = {"run": describe_run(), **result}
-        print(json.dumps(result, indent=2), flush=True)
         name = gym_id.removeprefix("hdp/").removesuffix("-v0")
         suffix = "" if options.robot == "primitive" else f"_{options.robot}"
-        (RESULTS / f"expert_{name}{suffix}.json").write_text(json.dumps(result, indent=2) + "\n")
+        path = RESULTS / f"expert_{name}{suffix}.json"
+        if is_finished(path, options.num_episodes) and not options.overwrite:
+            print(f"{gym_id}: kept {path.name}")
+            continue
+        run = describe_run()
+        result = {"run": run, **measure(gym_id, options.num_episodes, options.robot)}
+        print(json.dumps(result, indent=2), flush=True)
+        path.write_text(json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -24,6 +24,8 @@ from dataset_tools.experts import EXPERTS
 from gym_hdp_tasks import open_loop
 from gym_hdp_tasks.open_loop import execute_plans
 
+from .machine import describe_run
+
 RESULTS = Path(__file__).parent / "results" / "open_loop.json"
 SHAKE = 0.02
 """Standard deviation of what is added to half of the plans, in metres and in opening."""
@@ -102,7 +104,8 @@ def main() -> None:
     options = parser.parse_args()
     results = {}
     for gym_id in ("hdp/XArmSorting-v0", "hdp/XArmArrangeBlocks-v0", "hdp/XArmToolUse-v0"):
-        results[gym_id] = measure(gym_id, options.num_plans, options.num_cores)
+        run = describe_run()
+        results[gym_id] = {"run": run, **measure(gym_id, options.num_plans, options.num_cores)}
         print(gym_id, json.dumps(results[gym_id], indent=2))
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")
 

@@ -16,21 +16,44 @@ PAGES = {
 HEADING = "## Measured\n"
 
 
+COUPLED_SEEDS = """\
+These runs seeded the expert like the start, so that its choices followed from it; the script since gives it
+a seed of its own, and the runs are to be repeated.
+"""
+
+
+def load(name: str) -> dict:
+    """A results file; empty when it is not there."""
+    path = RESULTS / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
 def expert_table(task: str) -> str:
     """One expert's figures, as a table."""
-    own = json.loads((RESULTS / f"expert_{task}.json").read_text())
-    menagerie = json.loads((RESULTS / f"expert_{task}_menagerie.json").read_text())
+    own, menagerie = load(f"expert_{task}"), load(f"expert_{task}_menagerie")
+    replay = load("replay").get(f"{task}-v0")
     counts = own["plans"].values()
-    return f"""| {task} | |
-|---|---|
-| successes | {successes(own)}; with `robot="menagerie"` {successes(menagerie)} |
-| clipped actions | {own["clipped_actions"]} |
-| plans | {len(counts)} different ones, each chosen {min(counts)} to {max(counts)} times |
-| episodes per second, one process | {own["episodes_per_second"]:.1f} |
-| time inside `mj_step` | {own["physics_fraction"]:.0%} |
-
-`python -m benchmarks.experts --tasks {own["task"]} --num_episodes {own["num_episodes"]}`
-"""
+    rows = {
+        "successes": f'{successes(own)}; with `robot="menagerie"` {successes(menagerie)}',
+        "clipped actions": own["clipped_actions"],
+        "plans": f"{len(counts)} different ones, each chosen {min(counts)} to {max(counts)} times "
+        f"([counts](../../benchmarks/results/expert_{task}.json))",
+        "episodes per second, one process": f"{own['episodes_per_second']:.1f}",
+        "time inside `mj_step`": f"{own['physics_fraction']:.0%}",
+    }
+    if replay:
+        rows["recorded episodes that replay to the recorded score"] = (
+            f"{replay['same_score']} of {replay['num_episodes']}"
+        )
+    # Results without the facts of their run are from before the expert had a seed of its own.
+    caveat = "" if "run" in own and "run" in menagerie else f"{COUPLED_SEEDS}\n"
+    lines = [f"| {task} | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())]
+    commands = [
+        f"python -m benchmarks.experts --tasks {own['task']} --num_episodes {own['num_episodes']}",
+        *(["python -m benchmarks.replay"] if replay else []),
+    ]
+    table = "\n".join(lines)
+    return f"{machine(own)}{caveat}{table}\n\n{', '.join(f'`{command}`' for command in commands)}\n"
 
 
 def successes(result: dict) -> str:
@@ -38,31 +61,63 @@ def successes(result: dict) -> str:
     return f"{total - len(result['failures'])} of {total} seeded starts"
 
 
+def machine(result: dict) -> str:
+    """Where a result comes from, as a paragraph."""
+    if "run" not in result:
+        return "The figures are from two cores that a training run shared.\n\n"
+    run = result["run"]
+    return f"Measured on {run['cores']} cores ({run['cpu']}) at commit {run['git_commit']}.\n\n"
+
+
 def open_loop_table() -> str:
     """Plans per second by each way of executing them, as a table."""
-    results = json.loads((RESULTS / "open_loop.json").read_text())
+    results = load("open_loop")
     any_result = next(iter(results.values()))
+    num_plans, num_cores = any_result["num_plans"], any_result["num_cores"]
     ways = list(any_result["plans_per_second"])
-    lines = [f"| plans per second | {' | '.join(ways)} | bare physics, one thread |", "|---" * (len(ways) + 2) + "|"]
+    headings = [*ways, "bare physics, one thread", f"`execute_plans` / {num_cores} threads of bare physics"]
+    lines = [f"| plans per second | {' | '.join(headings)} |", "|---" * (len(headings) + 1) + "|"]
     for task, result in results.items():
-        speeds = [*result["plans_per_second"].values(), result["bare_physics_plans_per_second_per_thread"]]
-        lines.append(f"| {task} | {' | '.join(f'{speed:.1f}' for speed in speeds)} |")
+        bare = result["bare_physics_plans_per_second_per_thread"]
+        speeds = " | ".join(f"{speed:.1f}" for speed in [*result["plans_per_second"].values(), bare])
+        lines.append(f"| {task} | {speeds} | {result['plans_per_second']['execute_plans'] / bare / num_cores:.2f} |")
     agree = all(result["scores_agree"] for result in results.values())
-    lines += ["", f"{any_result['num_plans']} plans on {any_result['num_cores']} cores; all scores agree: {agree}."]
-    lines += ["", f"`python -m benchmarks.open_loop --num_plans {any_result['num_plans']}`", ""]
-    return "\n".join(lines)
+    lines += ["", f"{num_plans} plans on {num_cores} cores; all scores agree: {agree}."]
+    lines += ["", f"`python -m benchmarks.open_loop --num_plans {num_plans}`", ""]
+    return machine(any_result) + "\n".join(lines)
+
+
+def recording_table() -> str:
+    """How long `hdp-record` takes, as a table; empty before it was measured."""
+    results = load("recording")
+    if not results:
+        return ""
+    lines = [
+        "| hdp-record | episodes | seconds | episodes per second | inside `mj_step` | rendering |",
+        "|---|---|---|---|---|---|",
+    ]
+    for obs_type in ("state", "pixels_state"):
+        result = results[obs_type]
+        lines.append(
+            f"| {result['task']}, `{obs_type}` | {result['num_episodes']} | {result['seconds']:.0f} "
+            f"| {result['episodes_per_second']:.1f} | {result['physics_fraction']:.0%} "
+            f"| {result['rendering_fraction']:.0%} |"
+        )
+    workers = results["state"]["num_workers"]
+    lines += ["", f"{workers} workers, start-up included; the shares are those of one worker."]
+    lines += ["", "`python -m benchmarks.recording`", ""]
+    return "\n" + machine(results) + "\n".join(lines)
 
 
 def replace_measured(page: str, text: str) -> None:
     before = (FOLDER / page).read_text().split(HEADING)[0]
-    note = "The figures are from two cores that a training run shared.\n"
-    (FOLDER / page).write_text(f"{before}{HEADING}\n{note}\n{text}")
+    (FOLDER / page).write_text(f"{before}{HEADING}\n{text}")
 
 
 def main() -> None:
     for page, tasks in PAGES.items():
         replace_measured(page, "\n".join(expert_table(task) for task in tasks))
-    replace_measured("xarm.md", open_loop_table())
+    replace_measured("xarm.md", open_loop_table() + recording_table())
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ of processes: every episode has a seed of its own.
 import json
 import logging
 import multiprocessing
+import os
 import shutil
 import signal
 import sys
@@ -18,16 +19,19 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import av
 import datasets
 import gymnasium as gym
+import mujoco
 import numpy as np
 from draccus.utils import ParsingError
 from lerobot.configs import parser
+from lerobot.datasets import dataset_writer
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.io_utils import load_info, write_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import create_lerobot_dataset_card
-from lerobot.utils.constants import ACTION, DONE, HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_STATE, REWARD
+from lerobot.utils.constants import ACTION, DONE, HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE, REWARD, SUCCESS
 from tqdm import tqdm
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
@@ -36,9 +40,8 @@ from gym_hdp_tasks.env_config import HDPEnv
 
 from .demonstration import Demonstration, Expert, expert_generator
 from .experts import EXPERTS
+from .language import SYMBOLIC_PLAN, write_language_columns
 
-SYMBOLIC_PLAN = "observation.symbolic_plan"
-SUCCESS = "next.success"
 EPISODES_PER_SHARD = 25
 
 
@@ -50,6 +53,8 @@ class RecordDatasetConfig:
         repo_id: name of the dataset, `{hf_user}/{dataset_name}`.
         root: folder of the dataset. None: `$HF_LEROBOT_HOME/{repo_id}`.
         num_episodes: how many demonstrations.
+        video: write camera images as videos; as lossless images inside the data files when false.
+        language: write the plan as LeRobot's language columns too.
         push_to_hub: upload the dataset, with a card, when it is done.
         private: upload to a private repository. None: what the organisation's default is.
         tags: more tags for the card.
@@ -58,6 +63,8 @@ class RecordDatasetConfig:
     repo_id: str
     root: Path | None = None
     num_episodes: int = 200
+    video: bool = True
+    language: bool = False
     push_to_hub: bool = False
     private: bool | None = None
     tags: list[str] = field(default_factory=list)
@@ -69,7 +76,7 @@ class RecordConfig:
 
     Attributes:
         dataset: what is recorded and where it goes.
-        env: the task, as for `lerobot-eval`.
+        env: the task, as for `lerobot-eval`; `--env.obs_type=pixels_state` records its cameras too.
         seed: every start and every choice of the expert follow from it.
         num_workers: processes that record.
         resume: go on with a recording that was interrupted.
@@ -84,8 +91,6 @@ class RecordConfig:
     def __post_init__(self):
         if self.dataset.num_episodes < 1 or self.num_workers < 1:
             raise ParsingError("--dataset.num_episodes and --num_workers must be at least 1")
-        if self.env.obs_type != "state":
-            raise ParsingError("hdp-record writes no camera images yet: leave --env.obs_type at state")
 
     @property
     def root(self) -> Path:
@@ -122,8 +127,16 @@ def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
     return int(np.random.SeedSequence([seed, episode, attempt]).generate_state(1)[0])
 
 
-def demonstrate(env: gym.Env, expert: Expert, seed: int) -> Episode:
-    """Reset the environment, let the expert plan, and execute its plan to the end."""
+def demonstrate(env: gym.Env, expert: Expert, seed: int, features_map: dict[str, str]) -> Episode:
+    """Reset the environment, let the expert plan, and execute its plan to the end.
+
+    Args:
+        env: a task.
+        expert: who solves it.
+        seed: of the start, and of the expert's choices.
+        features_map: what is recorded of an observation: its key in the environment (`pixels/front` is key `front` of
+            the dictionary `pixels`) to the column.
+    """
     observation, _ = env.reset(seed=seed)
     demonstration = expert(env, expert_generator(seed))
     task: PlanningTask = env.unwrapped.planning_task  # type: ignore[attr-defined]
@@ -132,8 +145,7 @@ def demonstrate(env: gym.Env, expert: Expert, seed: int) -> Episode:
         next_observation, score, terminated, truncated, info = env.step(action)
         frames.append(
             {
-                OBS_STATE: observation["agent_pos"],
-                OBS_ENV_STATE: observation["environment_state"],
+                **{column: _entry(observation, key) for key, column in features_map.items() if key != ACTION},
                 ACTION: action,
                 SYMBOLIC_PLAN: remaining_token_ids(demonstration, frame, task),
                 REWARD: np.float32([score]),
@@ -146,22 +158,38 @@ def demonstrate(env: gym.Env, expert: Expert, seed: int) -> Episode:
     return Episode(columns, demonstration.remaining_symbols(0), float(score))
 
 
+def _entry(observation: dict[str, Any], key: str) -> np.ndarray:
+    """`observation["pixels"]["front"]` for the key `pixels/front`."""
+    for part in key.split("/"):
+        observation = observation[part]
+    return observation  # type: ignore[return-value]
+
+
 def remaining_token_ids(demonstration: Demonstration, frame: int, task: PlanningTask) -> np.ndarray:
     """Token ids of what remains of the plan at a frame, filled with PAD: (symbolic_horizon,) int64."""
     ids = [task.vocabulary.index(symbol) for symbol in demonstration.remaining_symbols(frame)]
     return np.array(ids + [0] * (task.symbolic_horizon - len(ids)), dtype=np.int64)
 
 
-def dataset_features(task: PlanningTask, seed: int) -> dict[str, dict[str, Any]]:
+def dataset_features(config: RecordConfig) -> dict[str, dict[str, Any]]:
     """The columns of a task's dataset. What explains it travels in the symbolic plan's `info`."""
+    task, env = config.env.planning_task, config.env
 
     def column(dtype: str, names: tuple[str, ...] | None, size: int | None = None, **more) -> dict[str, Any]:
         return {"dtype": dtype, "shape": (size or len(names),), "names": list(names) if names else None, **more}
 
-    return {
+    image = {
+        "dtype": "video" if config.dataset.video else "image",
+        "shape": (env.camera_height, env.camera_width, 3),
+        "names": ["height", "width", "channels"],
+    }
+    columns = {
         OBS_STATE: column("float32", task.state_names),
         OBS_ENV_STATE: column("float32", task.environment_state_names),
         ACTION: column("float32", task.action_names),
+    }
+    return {
+        **{name: image if name.startswith(OBS_IMAGES) else columns[name] for name in env.features_map.values()},
         SYMBOLIC_PLAN: column(
             "int64",
             None,
@@ -170,7 +198,7 @@ def dataset_features(task: PlanningTask, seed: int) -> dict[str, dict[str, Any]]
                 "vocabulary": list(task.vocabulary),
                 "gym_id": task.gym_id,
                 "parameters": task.parameters,
-                "seed": seed,
+                "seed": config.seed,
             },
         ),
         REWARD: column("float32", None, 1),
@@ -186,7 +214,7 @@ def record_episodes(config: RecordConfig, episodes: range) -> Iterator[tuple[Epi
     try:
         for index in episodes:
             for attempt in count():
-                episode = demonstrate(env, expert, episode_seed(config.seed, index, attempt))
+                episode = demonstrate(env, expert, episode_seed(config.seed, index, attempt), config.env.features_map)
                 if episode.columns[SUCCESS][-1]:
                     yield episode, attempt
                     break
@@ -203,42 +231,68 @@ def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = Non
     if is_complete(shard):
         return failed_attempts(shard)
     datasets.disable_progress_bars()  # one for every episode otherwise
+    av.logging.set_libav_level(av.logging.WARNING)
+    os.environ.setdefault("SVT_LOG", "1")  # errors only, of the AV1 encoder
+    dataset_writer.embed_images = _embed_images_if_any
     task = config.env.planning_task
+    # Videos are encoded while an episode is written, frame by frame; the queue holds a whole one, so that none drops.
+    encoding = {"streaming_encoding": True, "encoder_queue_maxsize": task.horizon, "encoder_threads": 1}
     if shard.root.exists() and not shard.done_file.exists():
         shutil.rmtree(shard.root)  # killed while it was written: its files have no footers
     if shard.root.exists():
         failed = failed_attempts(shard)
-        dataset = LeRobotDataset.resume(config.dataset.repo_id, root=shard.root, video_backend="pyav")
+        dataset = LeRobotDataset.resume(config.dataset.repo_id, root=shard.root, video_backend="pyav", **encoding)
     else:
         failed = {}
         dataset = LeRobotDataset.create(
             config.dataset.repo_id,
             fps=task.fps,
-            features=dataset_features(task, config.seed),
+            features=dataset_features(config),
             root=shard.root,
             robot_type=task.robot_type,
-            use_videos=False,
+            use_videos=config.dataset.video,
             video_backend="pyav",
+            **encoding,
         )
     shard.done_file.unlink(missing_ok=True)
     start = shard.start + dataset.meta.total_episodes
+    writing = False
     try:
         for index, (episode, attempts) in enumerate(record_episodes(config, range(start, shard.stop)), start):
+            writing = True
             for frame in range(len(episode.columns[ACTION])):
                 row = {key: column[frame] for key, column in episode.columns.items()}
                 dataset.add_frame({**row, "task": task.instruction})
             dataset.save_episode()
             if attempts:
                 failed[index] = attempts
+            writing = False
             if progress is not None:
                 progress.update()
     finally:
         dataset.finalize()
-        if dataset.meta.total_episodes:
-            shard.done_file.write_text(json.dumps(failed))
+        if writing or not dataset.meta.total_episodes:
+            shutil.rmtree(shard.root)  # a half written episode may be in the data and not in the metadata
         else:
-            shutil.rmtree(shard.root)
+            shard.done_file.write_text(json.dumps(failed))
     return failed
+
+
+def record_shard_in_worker(config: RecordConfig, shard: Shard) -> dict[int, int]:
+    """`record_shard`, after which a terminated process takes no other shard."""
+    try:
+        return record_shard(config, shard)
+    except SystemExit:
+        os._exit(1)
+
+
+_embed_images = dataset_writer.embed_images
+
+
+def _embed_images_if_any(dataset: datasets.Dataset) -> datasets.Dataset:
+    """LeRobot's `embed_images`, which takes as long as a third of the physics when there is nothing to embed."""
+    has_images = any(isinstance(feature, datasets.Image) for feature in dataset.features.values())
+    return _embed_images(dataset) if has_images else dataset
 
 
 def record(config: RecordConfig) -> LeRobotDataset:
@@ -246,8 +300,9 @@ def record(config: RecordConfig) -> LeRobotDataset:
 
     Raises:
         FileExistsError: the dataset's folder exists, or an interrupted recording does and `resume` is not set.
-        ValueError: the interrupted recording had other settings.
+        ValueError: the environment cannot be made, or the interrupted recording had other settings.
     """
+    try_environment(config)
     root, shards = config.root, plan_shards(config)
     failed: dict[int, int] = {}
     with tqdm(total=config.dataset.num_episodes, desc="Recording", unit="episode") as progress:
@@ -258,11 +313,17 @@ def record(config: RecordConfig) -> LeRobotDataset:
                 failed |= record_shard(config, shard, progress)
         else:
             context = multiprocessing.get_context("forkserver")
-            with ProcessPoolExecutor(config.num_workers, mp_context=context) as executor:
-                futures = {executor.submit(record_shard, config, shard): shard for shard in shards}
-                for future in as_completed(futures):
-                    failed |= future.result()
-                    progress.update(futures[future].stop - futures[future].start)
+            with ProcessPoolExecutor(config.num_workers, context, initializer=exit_when_terminated) as executor:
+                futures = {executor.submit(record_shard_in_worker, config, shard): shard for shard in shards}
+                try:
+                    for future in as_completed(futures):
+                        failed |= future.result()
+                        progress.update(futures[future].stop - futures[future].start)
+                except BaseException:
+                    executor.shutdown(wait=False, cancel_futures=True)
+                    for worker in multiprocessing.active_children():
+                        worker.terminate()
+                    raise
 
     dataset = merge_shards(config, shards, failed)
     dropped, attempts = sum(failed.values()), config.dataset.num_episodes + sum(failed.values())
@@ -276,12 +337,37 @@ def record(config: RecordConfig) -> LeRobotDataset:
     return dataset
 
 
+def try_environment(config: RecordConfig) -> None:
+    """Find out whether episodes can start, before there is anything on disk.
+
+    Raises:
+        ValueError: they cannot.
+    """
+    env = gym.make(config.env.gym_id, disable_env_checker=True, **config.env.gym_kwargs)
+    try:
+        env.reset(seed=0)
+    except mujoco.FatalError as error:
+        raise ValueError(f"cannot render images; without a display, set MUJOCO_GL=egl ({error})") from error
+    finally:
+        env.close()
+
+
+def exit_when_terminated() -> None:
+    """Leave by an exception on SIGTERM, so that what is finished is kept."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("hdp-record: terminated; go on with --resume=true"))
+
+
 def plan_shards(config: RecordConfig) -> list[Shard]:
     """The shards of a recording, in a folder beside the dataset's that remembers the settings."""
     partial = config.root.with_name(config.root.name + ".partial")
     if config.root.exists():
         raise FileExistsError(f"{config.root} exists already: delete it, or choose another --dataset.root")
-    settings = {"env": asdict(config.env), "seed": config.seed, "num_episodes": config.dataset.num_episodes}
+    settings = {
+        "env": asdict(config.env),
+        "seed": config.seed,
+        "num_episodes": config.dataset.num_episodes,
+        "video": config.dataset.video,
+    }
     settings = json.loads(json.dumps(settings, default=str))
     settings_file = partial / "settings.json"
     if partial.exists() and not config.resume:
@@ -313,6 +399,8 @@ def merge_shards(config: RecordConfig, shards: list[Shard], failed: dict[int, in
     repo_id = config.dataset.repo_id
     aggregate_datasets([repo_id] * len(shards), repo_id, roots=[shard.root for shard in shards], aggr_root=merged)
 
+    if config.dataset.language:
+        write_language_columns(merged, config.env.planning_task.vocabulary)
     info = load_info(merged)
     info.features[SYMBOLIC_PLAN]["info"]["failed_attempts"] = {str(k): v for k, v in sorted(failed.items())}
     write_info(info, merged)
@@ -353,12 +441,12 @@ def _main(config: RecordConfig) -> None:
 def main() -> None:
     """Entry point of `hdp-record`: bad input is one line on stderr and exit status 1."""
     logging.getLogger("lerobot").setLevel(logging.WARNING)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("hdp-record: terminated; go on with --resume=true"))
+    exit_when_terminated()
     try:
         _main()
     except KeyboardInterrupt:
         sys.exit("hdp-record: interrupted; go on with --resume=true")
-    except (ParsingError, ValueError, FileExistsError) as error:
+    except (ParsingError, ValueError, FileExistsError, ImportError) as error:
         sys.exit(f"hdp-record: {error}")
 
 

@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from .block_sorting_2d import block_sorting_2d_task
 from .task import PlanningTask
 from .xarm_arrange_blocks import xarm_arrange_blocks_task
-from .xarm_env import CAMERAS
+from .xarm_env import CAMERAS, OBS_TYPES
 from .xarm_sorting import xarm_sorting_task
 from .xarm_tool_use import xarm_tool_use_red_on_top_task, xarm_tool_use_task
 
@@ -56,15 +56,18 @@ class HDPEnv(EnvConfig):
             task = self.planning_task
         except ValueError as error:  # LeRobot's commands show the message of draccus' own error only
             raise ParsingError(str(error)) from error
+        obs_types = OBS_TYPES if self._is_xarm else ("state",)
+        if self.obs_type not in obs_types:
+            raise ParsingError(f"--env.obs_type of {self.task} must be one of {obs_types}, got {self.obs_type!r}")
         self.fps = task.fps
         self.features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(task.action_names),))}
         self.features_map = {ACTION: ACTION}
-        if not self._is_xarm or self.obs_type != "pixels":
+        if self.obs_type != "pixels":
             state = PolicyFeature(type=FeatureType.STATE, shape=(len(task.state_names),))
             poses = PolicyFeature(type=FeatureType.ENV, shape=(len(task.environment_state_names),))
             self.features |= {"agent_pos": state, "environment_state": poses}
             self.features_map |= {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
-        if self._is_xarm and self.obs_type != "state":
+        if self.obs_type != "state":
             image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.camera_height, self.camera_width, 3))
             self.features |= {f"pixels/{camera}": image for camera in CAMERAS}
             self.features_map |= {f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in CAMERAS}

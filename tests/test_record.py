@@ -98,13 +98,24 @@ def test_the_result_does_not_depend_on_the_number_of_processes(dataset_root, tmp
     assert_same_dataset(dataset_root, root)
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGKILL])
-def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, signal_number):
-    def flags(name):
-        return (*TASK_FLAGS, "--dataset.repo_id=t/t", f"--dataset.root={tmp_path / name}", "--dataset.num_episodes=80")
+def flags_of_80(root: Path) -> tuple[str, ...]:
+    return (*TASK_FLAGS, "--dataset.repo_id=t/t", f"--dataset.root={root}", "--dataset.num_episodes=80")
 
-    executable = Path(sys.executable).with_name("hdp-record")
-    process = subprocess.Popen([executable, *flags("stopped")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("datasets") / "uninterrupted"
+    run_command("hdp-record", *flags_of_80(root))
+    return root
+
+
+@pytest.mark.parametrize(
+    ("signal_number", "num_workers"), [(signal.SIGTERM, 1), (signal.SIGKILL, 1), (signal.SIGTERM, 2)]
+)
+def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_path, signal_number, num_workers):
+    flags = flags_of_80(tmp_path / "stopped")
+    command = [Path(sys.executable).with_name("hdp-record"), *flags, f"--num_workers={num_workers}"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     first_shard_done = tmp_path / "stopped.partial" / "episodes_000000.done"
     while not first_shard_done.exists():
         assert process.poll() is None
@@ -112,15 +123,15 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, signal_numb
     process.send_signal(signal_number)
     process.wait()
     assert not (tmp_path / "stopped").exists()
+    assert not first_shard_done.with_name("episodes_000075.done").exists()
     assert json.loads((first_shard_done.with_suffix("") / "meta/info.json").read_text())["total_episodes"] == 25
 
-    refused = run_command("hdp-record", *flags("stopped"), check=False)
+    refused = run_command("hdp-record", *flags, check=False)
     assert refused.returncode == 1
     assert refused.stderr.count("\n") == 1
     assert "--resume=true" in refused.stderr
-    run_command("hdp-record", *flags("stopped"), "--resume=true")
-    run_command("hdp-record", *flags("whole"))
-    assert_same_dataset(tmp_path / "stopped", tmp_path / "whole")
+    run_command("hdp-record", *flags, "--resume=true")
+    assert_same_dataset(tmp_path / "stopped", uninterrupted)
     assert not (tmp_path / "stopped.partial").exists()
 
 

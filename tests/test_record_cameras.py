@@ -1,0 +1,163 @@
+"""`hdp-record` with cameras and with LeRobot's language columns, read back by LeRobot itself."""
+
+import itertools
+from importlib.util import find_spec
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from draccus.utils import ParsingError
+from lerobot.datasets.language_render import active_at
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.utils.feature_utils import dataset_to_policy_features
+
+from benchmarks.replay import load_recording, replay
+from dataset_tools import record as recorder
+from dataset_tools.demonstration import expert_generator
+from dataset_tools.experts import EXPERTS
+from dataset_tools.language import write_language_columns
+from dataset_tools.record import RecordConfig, RecordDatasetConfig, episode_seed, record
+from gym_hdp_tasks.env_config import HDPEnv
+
+from .conftest import run_command
+
+SORTING = HDPEnv(task="XArmSorting-v0", obs_type="pixels_state", camera_height=32, camera_width=48)
+ARRANGE = HDPEnv(task="XArmArrangeBlocks-v0", obs_type="pixels_state", camera_height=32, camera_width=48)
+IMAGES = ("observation.images.front", "observation.images.wrist")
+N_EPISODES = 2
+
+
+def config(root: Path, env: HDPEnv = SORTING, num_episodes: int = N_EPISODES, num_workers: int = 1, **kwargs):
+    dataset = RecordDatasetConfig(repo_id="test/cameras", root=root, num_episodes=num_episodes, **kwargs)
+    return RecordConfig(dataset=dataset, env=env, num_workers=num_workers)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> LeRobotDataset:
+    """Two sorting demonstrations with videos and language columns."""
+    return record(config(tmp_path_factory.mktemp("datasets") / "cameras", language=True))
+
+
+def episode_of(dataset: LeRobotDataset, index: int) -> list[dict]:
+    episode = dataset.meta.episodes[index]
+    return [dataset[row] for row in range(episode["dataset_from_index"], episode["dataset_to_index"])]
+
+
+def test_a_policy_finds_the_columns_of_the_environment_under_its_own_names(dataset):
+    recorded = dataset_to_policy_features(dataset.meta.features)
+    for name, feature in env_to_policy_features(SORTING).items():
+        assert tuple(recorded[name].shape) == tuple(feature.shape), name
+        assert recorded[name].type == feature.type or name == "observation.environment_state"
+
+
+def test_a_video_shows_what_the_environment_showed(dataset):
+    env = gym.make(SORTING.gym_id, disable_env_checker=True, **SORTING.gym_kwargs)
+    for index in range(N_EPISODES):
+        observation, _ = env.reset(seed=episode_seed(0, index))
+        for frame in episode_of(dataset, index)[:20]:
+            np.testing.assert_allclose(frame["observation.state"], observation["agent_pos"], atol=1e-6)
+            for name in IMAGES:
+                shown = observation["pixels"][name.rsplit(".", 1)[1]].transpose(2, 0, 1) / 255
+                assert np.abs(frame[name].numpy() - shown).mean() < 0.03  # the codec loses some
+            observation, *_ = env.step(frame["action"].numpy())
+    env.close()
+
+
+def test_images_can_be_kept_without_loss(tmp_path):
+    pixels = HDPEnv(task=ARRANGE.task, obs_type="pixels", camera_height=32, camera_width=48)
+    dataset = record(config(tmp_path / "images", pixels, num_episodes=1, video=False))
+    assert not {"observation.state", "observation.environment_state"} & set(dataset.features)
+    env = gym.make(pixels.gym_id, disable_env_checker=True, **pixels.gym_kwargs)
+    observation, _ = env.reset(seed=episode_seed(0, 0))
+    for name in IMAGES:
+        shown = observation["pixels"][name.rsplit(".", 1)[1]].transpose(2, 0, 1)
+        np.testing.assert_array_equal((dataset[0][name].numpy() * 255).round(), shown)
+    env.close()
+
+
+def test_neither_the_number_of_processes_nor_an_interruption_changes_a_frame(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder, "EPISODES_PER_SHARD", 2)
+    whole = record(config(tmp_path / "two_processes", ARRANGE, num_episodes=4, num_workers=2))
+
+    expert, calls = EXPERTS[ARRANGE.gym_id], itertools.count()
+
+    def interrupted(env, rng):
+        if next(calls) == 1:
+            raise KeyboardInterrupt
+        return expert(env, rng)
+
+    monkeypatch.setitem(EXPERTS, ARRANGE.gym_id, interrupted)
+    settings = config(tmp_path / "interrupted", ARRANGE, num_episodes=4)
+    with pytest.raises(KeyboardInterrupt):
+        record(settings)
+    monkeypatch.setitem(EXPERTS, ARRANGE.gym_id, expert)
+    settings.resume = True
+    resumed = record(settings)
+    assert len(whole) == len(resumed) == 4 * ARRANGE.planning_task.horizon
+    for one, other in zip(whole, resumed, strict=True):
+        assert one.keys() == other.keys()
+        for key in (*IMAGES, "action", "observation.state", "episode_index", "timestamp"):
+            np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+
+
+@pytest.mark.parametrize("env", [SORTING, ARRANGE], ids=["videos", "no cameras"])
+def test_replaying_the_actions_from_the_seed_gives_the_recorded_score(dataset, tmp_path, env):
+    if env is ARRANGE:
+        dataset = record(config(tmp_path / "state", HDPEnv(task=ARRANGE.task), num_episodes=3))
+    recording = load_recording(dataset)
+    assert replay(recording) == recording.scores.tolist() == [1.0] * dataset.num_episodes
+    never_open = recording._replace(plans=recording.plans * [1, 1, 1, 0])
+    assert max(replay(never_open)) < 1.0
+
+
+def test_language_columns_say_which_step_is_being_done(dataset):
+    env = gym.make(SORTING.gym_id, disable_env_checker=True)
+    for index in range(N_EPISODES):
+        seed = episode_seed(0, index)
+        env.reset(seed=seed)
+        steps = EXPERTS[SORTING.gym_id](env, expert_generator(seed)).steps
+        for number, frame in enumerate(episode_of(dataset, index)):
+            left = [" ".join(step.symbols) for step in steps if step.stop > number] or ["done"]
+            rows, time = frame["language_persistent"], frame["timestamp"].item()
+            assert active_at(time, persistent=rows, style="subtask")["content"] == left[0]
+            plan = active_at(time, persistent=rows, style="plan")["content"]
+            assert [line.split(". ")[-1] for line in plan.splitlines()] == left
+            assert frame["language_events"] == []
+    with pytest.raises(ValueError, match="already"):
+        write_language_columns(dataset.root, SORTING.planning_task.vocabulary)
+
+
+def test_cameras_that_a_task_cannot_have_are_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ParsingError, match="must be one of"):
+        HDPEnv(task="BlockSorting2D-v0", obs_type="pixels")
+    without_pixels = HDPEnv(task="XArmSorting-v0", obs_type="pixels", camera_height=0)
+    with pytest.raises(ValueError, match="at least 1 pixel"):
+        record(config(tmp_path / "nothing", without_pixels))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(find_spec("diffusers") is None, reason="needs lerobot[diffusion]")
+def test_lerobot_trains_its_own_diffusion_policy_on_it(dataset, tmp_path):
+    result = run_command(
+        "lerobot-train",
+        "--policy.type=diffusion",
+        "--policy.pretrained_backbone_weights=null",
+        "--policy.use_group_norm=true",
+        "--policy.down_dims=[16,32]",
+        "--policy.horizon=16",
+        "--policy.n_action_steps=8",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        "--dataset.repo_id=test/cameras",
+        f"--dataset.root={dataset.root}",
+        "--dataset.video_backend=pyav",
+        f"--output_dir={tmp_path / 'run'}",
+        "--batch_size=2",
+        "--steps=2",
+        "--log_freq=1",
+        "--num_workers=0",
+    )
+    assert "step:2" in result.stderr
+    assert (tmp_path / "run/checkpoints/last/pretrained_model/model.safetensors").exists()
