@@ -222,14 +222,10 @@ def record_episodes(config: RecordConfig, episodes: range) -> Iterator[tuple[Epi
         env.close()
 
 
-def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = None) -> dict[int, int]:
-    """Record a shard, or what is missing of it. What is finished stays, whatever interrupts.
-
-    Returns:
-        How many attempts failed, for the episodes that needed more than one.
-    """
+def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = None) -> None:
+    """Record a shard, or what is missing of it. What is finished stays, whatever interrupts."""
     if is_complete(shard):
-        return failed_attempts(shard)
+        return
     datasets.disable_progress_bars()  # one for every episode otherwise
     av.logging.set_libav_level(av.logging.WARNING)
     os.environ.setdefault("SVT_LOG", "1")  # errors only, of the AV1 encoder
@@ -274,14 +270,15 @@ def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = Non
         if writing or not dataset.meta.total_episodes:
             shutil.rmtree(shard.root)  # a half written episode may be in the data and not in the metadata
         else:
-            shard.done_file.write_text(json.dumps(failed))
-    return failed
+            unfinished = shard.done_file.with_suffix(".unfinished")
+            unfinished.write_text(json.dumps(failed))
+            unfinished.replace(shard.done_file)  # at once, whatever interrupts
 
 
-def record_shard_in_worker(config: RecordConfig, shard: Shard) -> dict[int, int]:
+def record_shard_in_worker(config: RecordConfig, shard: Shard) -> None:
     """`record_shard`, after which a terminated process takes no other shard."""
     try:
-        return record_shard(config, shard)
+        record_shard(config, shard)
     except SystemExit:
         os._exit(1)
 
@@ -290,7 +287,10 @@ _embed_images = dataset_writer.embed_images
 
 
 def _embed_images_if_any(dataset: datasets.Dataset) -> datasets.Dataset:
-    """LeRobot's `embed_images`, which takes as long as a third of the physics when there is nothing to embed."""
+    """LeRobot's `embed_images`, which takes as long as a third of the physics when there is nothing to embed.
+
+    To be removed when LeRobot skips it for a dataset without images.
+    """
     has_images = any(isinstance(feature, datasets.Image) for feature in dataset.features.values())
     return _embed_images(dataset) if has_images else dataset
 
@@ -303,21 +303,20 @@ def record(config: RecordConfig) -> LeRobotDataset:
         ValueError: the environment cannot be made, or the interrupted recording had other settings.
     """
     try_environment(config)
-    root, shards = config.root, plan_shards(config)
-    failed: dict[int, int] = {}
+    shards = plan_shards(config)
     with tqdm(total=config.dataset.num_episodes, desc="Recording", unit="episode") as progress:
         if config.num_workers == 1:
             for shard in shards:
                 if is_complete(shard):
                     progress.update(shard.stop - shard.start)
-                failed |= record_shard(config, shard, progress)
+                record_shard(config, shard, progress)
         else:
             context = multiprocessing.get_context("forkserver")
             with ProcessPoolExecutor(config.num_workers, context, initializer=exit_when_terminated) as executor:
                 futures = {executor.submit(record_shard_in_worker, config, shard): shard for shard in shards}
                 try:
                     for future in as_completed(futures):
-                        failed |= future.result()
+                        future.result()
                         progress.update(futures[future].stop - futures[future].start)
                 except BaseException:
                     executor.shutdown(wait=False, cancel_futures=True)
@@ -325,9 +324,17 @@ def record(config: RecordConfig) -> LeRobotDataset:
                         worker.terminate()
                     raise
 
-    dataset = merge_shards(config, shards, failed)
+    return merge_shards(config, shards)
+
+
+def merge_shards(config: RecordConfig, shards: list[Shard]) -> LeRobotDataset:
+    """Make one dataset of the shards, remove them, and upload the dataset if that is wanted."""
+    failed = {episode: attempts for shard in shards for episode, attempts in failed_attempts(shard).items()}
+    dataset = _merge(config, shards, failed)
     dropped, attempts = sum(failed.values()), config.dataset.num_episodes + sum(failed.values())
-    print(f"{dataset.num_episodes} episodes in {root}; dropped {dropped} of {attempts} demonstrations that failed")
+    print(
+        f"{dataset.num_episodes} episodes in {config.root}; dropped {dropped} of {attempts} demonstrations that failed"
+    )
     if config.dataset.push_to_hub:
         dataset.push_to_hub(
             tags=[*CARD_TAGS, *config.dataset.tags],
@@ -391,8 +398,7 @@ def failed_attempts(shard: Shard) -> dict[int, int]:
     return {int(episode): attempts for episode, attempts in json.loads(shard.done_file.read_text()).items()}
 
 
-def merge_shards(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) -> LeRobotDataset:
-    """Make one dataset of the shards and remove them."""
+def _merge(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) -> LeRobotDataset:
     partial = shards[0].root.parent
     merged = partial / "merged"
     shutil.rmtree(merged, ignore_errors=True)

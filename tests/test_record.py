@@ -98,6 +98,14 @@ def test_the_result_does_not_depend_on_the_number_of_processes(dataset_root, tmp
     assert_same_dataset(dataset_root, root)
 
 
+def test_a_cluster_engine_records_the_same_dataset(dataset_root, tmp_path):
+    root = tmp_path / "cluster"
+    flags = ("--dataset.repo_id=test/sorting", f"--dataset.root={root}", f"--dataset.num_episodes={N_EPISODES}")
+    run_command("python", "-m", "dataset_tools.record_on_cluster", *TASK_FLAGS, *flags, "--num_workers=2")
+    assert_same_dataset(dataset_root, root)
+    assert not root.with_name("cluster.partial").exists()
+
+
 def flags_of_80(root: Path) -> tuple[str, ...]:
     return (*TASK_FLAGS, "--dataset.repo_id=t/t", f"--dataset.root={root}", "--dataset.num_episodes=80")
 

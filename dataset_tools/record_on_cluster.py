@@ -1,0 +1,112 @@
+"""`hdp-record` on many machines: its shards as tasks of datatrove, the engine of LeRobot's own porting scripts.
+
+    python -m dataset_tools.record_on_cluster --env.task=XArmToolUse-v0 --dataset.num_episodes=4000 \\
+        --dataset.repo_id=me/xarm_tool_use --dataset.root=/shared/xarm_tool_use \\
+        --num_workers=40 --slurm.partition=cpu
+
+Takes all flags of `hdp-record`; the dataset that comes out is the same. A shard is 25 episodes, each with a seed of its
+own, so that it does not matter which machine records it. When all are done, one more task merges them with LeRobot's
+`aggregate_datasets`. A failed or interrupted job goes on when the same command is given again. The dataset's folder
+must be one that all machines see; the engine's logs are written beside it. Needs the extra `cluster`:
+`pip install 'lerobot_policy_hdp[cluster]'`.
+"""
+
+import os
+import sys
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from datatrove.executor import LocalPipelineExecutor, SlurmPipelineExecutor
+from draccus.utils import ParsingError
+from lerobot.configs import parser
+
+from .record import RecordConfig, Shard, merge_shards, plan_shards, record_shard, try_environment
+
+
+@dataclass
+class SlurmConfig:
+    """Where the tasks run.
+
+    Attributes:
+        partition: Slurm's partition. None: this machine, in `num_workers` processes.
+        time: limit for a task, `hours:minutes:seconds`.
+        mem_per_cpu_gb: memory of a task, in GB.
+    """
+
+    partition: str | None = None
+    time: str = "01:00:00"
+    mem_per_cpu_gb: int = 4
+
+
+@dataclass
+class ClusterRecordConfig(RecordConfig):
+    """Options of `hdp-record`, and the cluster's. `num_workers` tasks run at a time; `resume` is always on."""
+
+    slurm: SlurmConfig = field(default_factory=SlurmConfig)
+    resume: bool = True
+
+
+def record_task(config: RecordConfig, shards: list[Shard], _: Any, rank: int, world_size: int) -> None:
+    """One of `world_size` tasks of the engine."""
+    for shard in shards[rank::world_size]:
+        record_shard(config, shard)
+
+
+def merge_task(config: RecordConfig, shards: list[Shard], _: Any, rank: int, world_size: int) -> None:
+    """The last task."""
+    merge_shards(config, shards)
+
+
+def record_on_cluster(config: ClusterRecordConfig) -> None:
+    """Record, or submit the jobs that do.
+
+    Raises:
+        FileExistsError: the dataset's folder exists.
+        ValueError: the environment cannot be made, or the interrupted recording had other settings.
+    """
+    try_environment(config)
+    shards = plan_shards(config)
+    logs = config.root.with_name(config.root.name + ".logs")
+
+    def executor(name: str, task: Any, tasks: int, **kwargs: Any) -> LocalPipelineExecutor | SlurmPipelineExecutor:
+        common = {
+            "pipeline": [partial(task, config, shards)],
+            "tasks": tasks,
+            "logging_dir": str(logs / name),
+            "skip_completed": False,  # a shard knows itself
+            **kwargs,
+        }
+        workers = min(config.num_workers, tasks)
+        if config.slurm.partition is None:
+            return LocalPipelineExecutor(workers=workers, **common)
+        return SlurmPipelineExecutor(
+            job_name=f"hdp-record-{name}",
+            workers=workers,
+            partition=config.slurm.partition,
+            time=config.slurm.time,
+            mem_per_cpu_gb=config.slurm.mem_per_cpu_gb,
+            venv_path=str(Path(sys.prefix) / "bin" / "activate"),
+            **common,
+        )
+
+    recording = executor("record", record_task, len(shards))
+    executor("merge", merge_task, 1, depends=recording).run()
+
+
+@parser.wrap()
+def _main(config: ClusterRecordConfig) -> None:
+    record_on_cluster(config)
+
+
+def main() -> None:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        _main()
+    except (ParsingError, ValueError, FileExistsError) as error:
+        sys.exit(f"record_on_cluster: {error}")
+
+
+if __name__ == "__main__":
+    main()
