@@ -12,15 +12,13 @@ import os
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
-import gym_hdp_tasks  # noqa: F401 (registers the tasks)
-from dataset_tools.record import RecordConfig, RecordDatasetConfig, episode_seed, record
+from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
+from dataset_tools.replay import load_recording, replay
 from gym_hdp_tasks.env_config import TASKS, HDPEnv
 
 from .machine import describe_run
@@ -29,49 +27,6 @@ RESULTS = Path(__file__).parent / "results" / "replay.json"
 DATASETS = Path("outputs/benchmarks/replay")
 EPISODES_PER_PART = 5
 XARM_TASKS = [task for task in TASKS if task.startswith("XArm")]
-
-
-class Recording(NamedTuple):
-    """What it takes to replay episodes.
-
-    Attributes:
-        gym_id: the task.
-        parameters: of the task, for `gymnasium.make`.
-        seeds: of the starts of B episodes.
-        plans: (B, horizon, action size) their actions.
-        scores: (B,) their last rewards.
-    """
-
-    gym_id: str
-    parameters: dict[str, Any]
-    seeds: list[int]
-    plans: np.ndarray
-    scores: np.ndarray
-
-    def part(self, start: int, stop: int) -> "Recording":
-        episodes = slice(start, stop)
-        return self._replace(seeds=self.seeds[episodes], plans=self.plans[episodes], scores=self.scores[episodes])
-
-
-def load_recording(dataset: LeRobotDataset) -> Recording:
-    """Actions and scores of a dataset that `hdp-record` wrote, with the seeds that its metadata tell."""
-    info = dataset.meta.features["observation.symbolic_plan"]["info"]
-    attempts = [info["failed_attempts"].get(str(episode), 0) for episode in range(dataset.num_episodes)]
-    seeds = [episode_seed(info["seed"], episode, attempt) for episode, attempt in enumerate(attempts)]
-    rows = dataset.hf_dataset.with_format("numpy")
-    plans = np.stack(rows["action"]).reshape(len(seeds), -1, dataset.meta.shapes["action"][0])
-    scores = np.stack(rows["next.reward"]).reshape(len(seeds), -1)[:, -1]
-    return Recording(info["gym_id"], info["parameters"], seeds, plans, scores)
-
-
-def replay(recording: Recording) -> list[float]:
-    """The scores of executing the actions again, each episode in an environment that is reset to its seed."""
-    env = gym.make(recording.gym_id, disable_env_checker=True, **recording.parameters)
-    scores = []
-    for seed, plan in zip(recording.seeds, recording.plans, strict=True):
-        env.reset(seed=seed)
-        scores.append([env.step(action)[1] for action in plan][-1])
-    return scores
 
 
 def measure(task: str, num_episodes: int, num_workers: int) -> dict[str, object]:
@@ -85,7 +40,7 @@ def measure(task: str, num_episodes: int, num_workers: int) -> dict[str, object]
     parts = [recording.part(start, start + EPISODES_PER_PART) for start in range(0, num_episodes, EPISODES_PER_PART)]
     with ProcessPoolExecutor(num_workers, get_context("forkserver")) as workers:
         scores = np.concatenate(list(tqdm(workers.map(replay, parts), total=len(parts), desc=f"Replaying {task}")))
-    same = scores == recording.scores
+    same = scores.astype(np.float32) == recording.scores  # as a dataset stores them
     return {
         "num_episodes": num_episodes,
         "same_score": int(same.sum()),

@@ -1,0 +1,56 @@
+"""Execute a dataset's actions again, from the seeds that it was recorded with."""
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, REWARD
+
+import gym_hdp_tasks  # noqa: F401 (registers the tasks)
+
+from .language import SYMBOLIC_PLAN
+from .record import episode_seed
+
+
+class Recording(NamedTuple):
+    """What it takes to replay episodes.
+
+    Attributes:
+        gym_id: the task.
+        parameters: of the task, for `gymnasium.make`.
+        seeds: of the starts of B episodes.
+        plans: (B, horizon, action size) their actions.
+        scores: (B,) their last rewards.
+    """
+
+    gym_id: str
+    parameters: dict[str, Any]
+    seeds: list[int]
+    plans: np.ndarray
+    scores: np.ndarray
+
+    def part(self, start: int, stop: int) -> "Recording":
+        episodes = slice(start, stop)
+        return self._replace(seeds=self.seeds[episodes], plans=self.plans[episodes], scores=self.scores[episodes])
+
+
+def load_recording(dataset: LeRobotDataset) -> Recording:
+    """Actions and scores of a dataset that `hdp-record` wrote, with the seeds that its metadata tell."""
+    info = dataset.meta.features[SYMBOLIC_PLAN]["info"]
+    attempts = [info["failed_attempts"].get(str(episode), 0) for episode in range(dataset.num_episodes)]
+    seeds = [episode_seed(info["seed"], episode, attempt) for episode, attempt in enumerate(attempts)]
+    rows = dataset.hf_dataset.with_format("numpy")
+    plans = np.stack(rows[ACTION]).reshape(len(seeds), -1, dataset.meta.shapes[ACTION][0])
+    scores = np.stack(rows[REWARD]).reshape(len(seeds), -1)[:, -1]
+    return Recording(info["gym_id"], info["parameters"], seeds, plans, scores)
+
+
+def replay(recording: Recording) -> list[float]:
+    """The scores of executing the actions again, each episode in an environment that is reset to its seed."""
+    env = gym.make(recording.gym_id, disable_env_checker=True, **recording.parameters)
+    scores = []
+    for seed, plan in zip(recording.seeds, recording.plans, strict=True):
+        env.reset(seed=seed)
+        scores.append([env.step(action)[1] for action in plan][-1])
+    return scores
