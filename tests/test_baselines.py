@@ -1,13 +1,19 @@
 """The contract that every planner keeps, and what each baseline does differently."""
 
+import json
+import shutil
+import sys
+
 import pytest
 import torch
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
+from lerobot.scripts import lerobot_eval, lerobot_train
+from safetensors.torch import load_file
 
 from lerobot_hdp import FREE, PlanPrompt
 
-from .conftest import HORIZON
+from .conftest import HORIZON, TASK_FLAGS, TINY_PLANNER
 
 CONTINUOUS_SYMBOLS = ["joint_diffuser", "separate_diffuser"]
 WITH_SYMBOLS = ["hdp", *CONTINUOUS_SYMBOLS]
@@ -117,6 +123,58 @@ class TestContract:
         loss.backward()
         assert torch.isfinite(loss)
         assert policy.eval().plan(observation(inputs)).actions.dtype == torch.float32
+
+    def test_lerobot_trains_resumes_and_evaluates_it(self, dataset_root, planner, tmp_path, monkeypatch):
+        """LeRobot's own commands, called in this process to save their start."""
+
+        def run(command, *arguments):
+            monkeypatch.setattr(sys, "argv", [command.__module__, *map(str, arguments)])
+            command()
+
+        whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+        run(
+            lerobot_train.main,
+            "--dataset.repo_id=test/sorting",
+            f"--dataset.root={dataset_root}",
+            "--dataset.video_backend=pyav",
+            f"--policy.type={planner}",
+            *(f"--policy.{name}={value}" for name, value in TINY_PLANNER.items()),
+            "--policy.dropout=0.3",
+            "--policy.push_to_hub=false",
+            "--policy.device=cpu",
+            f"--output_dir={whole}",
+            "--batch_size=8",
+            "--steps=8",
+            "--save_freq=5",
+            "--num_workers=0",
+            "--env.type=hdp",
+            *TASK_FLAGS,
+            "--env_eval_freq=0",
+        )
+        shutil.copytree(whole / "checkpoints/000005", stopped / "checkpoints/000005")
+        (stopped / "checkpoints/last").symlink_to("000005")
+        config = stopped / "checkpoints/last/pretrained_model/train_config.json"
+        run(lerobot_train.main, f"--config_path={config}", "--resume=true", f"--output_dir={stopped}")
+        checkpoint = stopped / "checkpoints/000008/pretrained_model"
+        first, second = (
+            load_file(run_dir / "checkpoints/000008/pretrained_model/model.safetensors") for run_dir in (whole, stopped)
+        )
+        assert first.keys() == second.keys()
+        assert all(torch.equal(first[key], second[key]) for key in first)
+
+        run(
+            lerobot_eval.main,
+            f"--policy.path={checkpoint}",
+            "--env.type=hdp",
+            *TASK_FLAGS,
+            "--eval.n_episodes=2",
+            "--eval.batch_size=2",
+            "--eval.use_async_envs=false",
+            f"--output_dir={tmp_path / 'eval'}",
+        )
+        overall = json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]
+        assert overall["n_episodes"] == 2
+        assert 0 <= overall["pc_success"] <= 100
 
     def test_nan_in_an_observation_is_refused(self, make_planner, batch, planner):
         policy, preprocessor, _ = make_planner(planner)
