@@ -67,8 +67,8 @@ class Protocol:
     """
 
     num_episodes: int = 200
-    steps: dict[int, int] = field(default_factory=lambda: {2: 1000, 3: 1500})
-    evaluate_every: dict[int, int] = field(default_factory=lambda: {2: 125, 3: 250})
+    steps: dict[int, int] = field(default_factory=lambda: {2: 800, 3: 1500})
+    evaluate_every: dict[int, int] = field(default_factory=lambda: {2: 100, 3: 250})
     starts: int = 100
     batch_size: int = 50
     network: dict[str, Any] = field(

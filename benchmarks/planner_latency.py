@@ -30,7 +30,7 @@ from lerobot_hdp.modeling_hdp import HDPPolicy
 from .machine import describe_run
 
 RESULTS = Path(__file__).parent / "results" / "planner_latency.json"
-PLANNERS = ("diffuser", "hdp", "joint_diffuser", "separate_diffuser")
+PLANNERS = ("diffuser", "hdp", "joint_diffuser", "separate_diffuser", "hd", "chd")
 REFERENCE = "diffuser"
 PAPER_SYMBOLIC_HORIZON = 108
 """H_d of the paper's sorting tasks, filled with PAD."""
