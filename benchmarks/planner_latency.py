@@ -2,7 +2,7 @@
 
 python -m benchmarks.planner_latency
 
-Networks have the paper's size and random weights. Every round times each planner once, in a new order, so that
+Writes `benchmarks/results/planner_latency.json` and, from it, `docs/planner_latency.md`. Networks have the paper's size and random weights. Every round times each planner once, in a new order, so that
 whatever else the machine does falls on all of them; a ratio compares two times of the same round. A plan takes
 `--num_inference_steps` network calls on each level of a planner, fewer than the paper's 100: the ratios depend little
 on their number.
@@ -30,6 +30,7 @@ from lerobot_hdp.modeling_hdp import HDPPolicy
 from .machine import describe_run
 
 RESULTS = Path(__file__).parent / "results" / "planner_latency.json"
+TABLE = Path("docs/planner_latency.md")
 PLANNERS = ("diffuser", "hdp", "joint_diffuser", "separate_diffuser", "hd", "chd")
 REFERENCE = "diffuser"
 PAPER_SYMBOLIC_HORIZON = 108
@@ -85,6 +86,31 @@ def measure(planners: dict[str, HDPPolicy], batch_size: int, rounds: int) -> dic
     }
 
 
+def write_table() -> None:
+    """Write the page from the results file."""
+    content = json.loads(RESULTS.read_text())
+    run, result = content["run"], content["result"]
+    sizes = result["batch_size"]
+    lines = [
+        "# Size and latency of the planners",
+        "",
+        f"Written by `{run['command']}` (code of {run['git_commit']}) on {result['device']} ({run['cpu']}, "
+        f"{result['threads']} thread of PyTorch), for `{result['task']}`: {result['num_layers']} layers of width "
+        f"{result['width']}, {result['num_inference_steps']} steps a plan. Median and quartiles of {result['rounds']} "
+        "rounds; a ratio compares two times of the same round.",
+        "",
+        "| planner | parameters | over Diffuser |" + "".join(f" batch {n}, ms | over Diffuser |" for n in sizes),
+        "|---|---|---|" + "---|---|" * len(sizes),
+    ]
+    for name in PLANNERS:
+        cells = [f"`{name}`", f"{result['parameters'][name]:,}", f"{result['parameter_ratio'][name] - 1:+.1%}"]
+        for measured in sizes.values():
+            for low, middle, high in (measured[name]["ms"], measured[name]["ratio"]):
+                cells.append(f"{middle:g} ({low:g} to {high:g})")
+        lines.append(f"| {' | '.join(cells)} |")
+    TABLE.write_text("\n".join(lines) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="XArmSorting-v0")
@@ -117,7 +143,8 @@ def main() -> None:
         "batch_size": {size: measure(planners, size, options.rounds) for size in options.batch_sizes},
     }
     RESULTS.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
-    print(RESULTS.read_text())
+    write_table()
+    print(TABLE.read_text())
 
 
 if __name__ == "__main__":

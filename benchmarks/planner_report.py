@@ -105,20 +105,21 @@ def write_plot(results: Results) -> None:
     matplotlib.rcParams["svg.hashsalt"] = "planners"  # the same results make the same file
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(
-        1, len(results), figsize=(4 * len(results), 3.4), sharey=True, squeeze=False, layout="constrained"
-    )
-    for axis, (panel, planners) in zip(axes[0], results.items(), strict=True):
+    columns = min(2, len(results))
+    rows = -(-len(results) // columns)
+    size = (4.5 * columns, 3 * rows)
+    figure, axes = plt.subplots(rows, columns, figsize=size, sharey=True, squeeze=False, layout="constrained")
+    for axis, (panel, planners) in zip(axes.flat, results.items(), strict=False):
         for planner in sorted(planners, key=PLANNERS.index):
             colour = f"C{PLANNERS.index(planner)}"
             steps = [point["step"] for point in planners[planner][0]["curve"]]
             rates = list(zip(*([p["success_rate"] for p in cell["curve"]] for cell in planners[planner]), strict=True))
             axis.plot(steps, [mean(seeds) for seeds in rates], color=colour, label=LABELS[planner])
             axis.fill_between(steps, list(map(min, rates)), list(map(max, rates)), color=colour, alpha=0.15, lw=0)
-        axis.set(title=panel.title, xlabel="optimiser steps", ylim=(0, 1))
+        axis.set(title=panel.title, xlabel="optimiser steps", ylabel="success rate", ylim=(0, 1))
+        axis.label_outer()
         axis.grid(alpha=0.3)
-    axes[0, 0].set_ylabel("success rate")
-    axes[0, 0].legend(fontsize="small")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper")
     figure.savefig(PLOT, metadata={"Date": None})
 
 

@@ -39,7 +39,7 @@ class HierarchicalPlanner(nn.Module):
                 vocabulary_size=0,
                 symbolic_horizon=0,
                 symbol_states=0,
-                shared_level=True,
+                shared_level=config.shared_level,
                 num_layers=config.num_layers,
                 num_heads=config.num_heads,
                 width=config.width,
