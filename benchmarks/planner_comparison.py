@@ -2,7 +2,7 @@
 
 python -m benchmarks.planner_comparison              # runs what is missing, then writes the table and the plot
 python -m benchmarks.planner_comparison --list       # says what is finished and what is not
-python -m benchmarks.planner_comparison --report     # only writes the table and the plot (needs matplotlib)
+python -m benchmarks.planner_comparison --report     # only writes the table and the plot (needs the extra `benchmarks`)
 
 A cell is one planner, trained with one seed. It trains in this process, on the dataset held in memory, with LeRobot's
 own policies, processors, optimizers and schedulers, and is evaluated by LeRobot's own rollout. Its learning curve goes
@@ -46,6 +46,7 @@ from .planner_latency import PLANNERS, num_parameters
 RESULTS = Path(__file__).parent / "results" / "planners"
 WORK = Path("outputs/benchmarks/planners")
 DATASETS = Path("outputs/datasets")
+PREDICTION_TYPES = ("sample", "epsilon")
 HIERARCHICAL = ("hd", "chd")
 """Two networks each, so that their size is reported and not matched."""
 MAX_SIZE_RATIO = 1.02
@@ -58,24 +59,20 @@ class Protocol:
 
     Attributes:
         num_episodes: demonstrations.
-        steps: optimiser steps, for each number of blocks.
+        steps: optimiser steps.
         evaluate_every: optimiser steps between two evaluations; divides `steps`.
         starts: fresh starts of an evaluation, the same for all planners and others at each evaluation.
         batch_size: divides the number of demonstrations.
         network: options of every policy.
-        prediction: options of every policy, for each prediction type.
     """
 
     num_episodes: int = 200
-    steps: dict[int, int] = field(default_factory=lambda: {2: 800, 3: 1500})
-    evaluate_every: dict[int, int] = field(default_factory=lambda: {2: 100, 3: 250})
+    steps: int = 1500
+    evaluate_every: int = 250
     starts: int = 100
     batch_size: int = 50
     network: dict[str, Any] = field(
         default_factory=lambda: {"num_layers": 5, "width": 112, "dtype": "bfloat16", "num_inference_steps": 50}
-    )
-    prediction: dict[str, dict[str, Any]] = field(
-        default_factory=lambda: {"sample": {}, "epsilon": {"optimizer_lr": 5e-4}}
     )
 
 
@@ -104,17 +101,21 @@ class Cell:
     def env(self) -> HDPEnv:
         return HDPEnv(task="BlockSorting2D-v0", n_blocks=self.n_blocks, waypoints_per_pose=1)
 
+    def policy_options(self, protocol: Protocol) -> dict[str, Any]:
+        """What differs from the `default` preset."""
+        options = {"prediction_type": self.prediction_type, **protocol.network}
+        if self.prediction_type == "epsilon":
+            options["optimizer_lr"] = 5e-4
+            if self.planner == "hdp":
+                options["symbol_loss_weight"] = 1 / 30  # the paper's, against the error of the noise
+        return options
+
     def policy_config(self, protocol: Protocol) -> PreTrainedConfig:
-        """The `default` preset, with the size and the prediction type of the comparison."""
-        options = {**protocol.network, **protocol.prediction[self.prediction_type]}
-        if self.planner == "hdp" and self.prediction_type == "epsilon":
-            options["symbol_loss_weight"] = 1 / 30  # the paper's, against the error of the noise
         return PreTrainedConfig.get_choice_class(self.planner)(
             horizon=self.env.planning_task.horizon,
-            prediction_type=self.prediction_type,
             device="cpu",
             push_to_hub=False,
-            **options,
+            **self.policy_options(protocol),
         )
 
 
@@ -162,7 +163,7 @@ class Training:
         if cell.checkpoint.exists():
             self.policy = get_policy_class(cell.planner).from_pretrained(cell.checkpoint)
         self.optimizer = config.get_optimizer_preset().build(self.policy.get_optim_params())
-        self.scheduler = config.get_scheduler_preset().build(self.optimizer, protocol.steps[cell.n_blocks])
+        self.scheduler = config.get_scheduler_preset().build(self.optimizer, protocol.steps)
         if cell.checkpoint.exists():
             self.step, self.optimizer, self.scheduler = load_training_state(
                 cell.checkpoint, self.optimizer, self.scheduler
@@ -228,8 +229,8 @@ def run_cell(cell: Cell, protocol: Protocol, run_facts: dict[str, object]) -> No
     """Train and evaluate one planner, from where it stopped, and write its result."""
     torch.set_num_threads(1)
     training = Training(cell, protocol)
-    while training.step < protocol.steps[cell.n_blocks]:
-        training.train(protocol.evaluate_every[cell.n_blocks])
+    while training.step < protocol.steps:
+        training.train(protocol.evaluate_every)
         training.evaluate()
         training.save()
         print(cell.name, training.curve[-1], flush=True)
@@ -241,11 +242,13 @@ def run_cell(cell: Cell, protocol: Protocol, run_facts: dict[str, object]) -> No
         "parameters": num_parameters(training.policy),
         "batch_size": protocol.batch_size,
         "starts": protocol.starts,
-        "policy": {**protocol.network, **protocol.prediction[cell.prediction_type]},
+        "policy": cell.policy_options(protocol),
         "curve": training.curve,
     }
     cell.result_file.parent.mkdir(parents=True, exist_ok=True)
-    cell.result_file.write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
+    unfinished = cell.result_file.with_suffix(".new")
+    unfinished.write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
+    unfinished.rename(cell.result_file)
     shutil.rmtree(cell.checkpoint)
 
 
@@ -277,8 +280,8 @@ def state_of(cell: Cell) -> str:
 def main() -> None:
     protocol = Protocol()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--n_blocks", type=int, nargs="+", default=[2, 3], choices=protocol.steps)
-    parser.add_argument("--predictions", nargs="+", default=["sample", "epsilon"], choices=protocol.prediction)
+    parser.add_argument("--n_blocks", type=int, nargs="+", default=[2, 3])
+    parser.add_argument("--predictions", nargs="+", default=PREDICTION_TYPES, choices=PREDICTION_TYPES)
     parser.add_argument("--planners", nargs="+", default=PLANNERS, choices=PLANNERS)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--processes", type=int, default=1, help="cells at a time, each on one core")

@@ -2,10 +2,10 @@
 
 python -m benchmarks.planner_latency
 
-Writes `benchmarks/results/planner_latency.json` and, from it, `docs/planner_latency.md`. Networks have the paper's size and random weights. Every round times each planner once, in a new order, so that
-whatever else the machine does falls on all of them; a ratio compares two times of the same round. A plan takes
-`--num_inference_steps` network calls on each level of a planner, fewer than the paper's 100: the ratios depend little
-on their number.
+Writes `benchmarks/results/planner_latency.json` and, from it, `docs/planner_latency.md`. Networks have the paper's size
+and random weights. Every round times each planner once, in a new order, so that whatever else the machine does falls on
+all of them; a ratio compares two times of the same round. A plan takes `--num_inference_steps` network calls on each
+level of a planner, fewer than the paper's 100: the ratios depend little on their number.
 """
 
 import argparse

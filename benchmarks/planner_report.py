@@ -39,7 +39,11 @@ Results = dict[Panel, dict[str, list[dict[str, Any]]]]
 
 
 def read_results(files: Iterable[Path]) -> tuple[Results, set[str]]:
-    """The results, and the commits that they come from."""
+    """The results, and the commits that they come from.
+
+    Raises:
+        ValueError: cells that are compared differ in training or evaluation.
+    """
     results: Results = defaultdict(lambda: defaultdict(list))
     commits = set()
     for file in files:
@@ -47,6 +51,11 @@ def read_results(files: Iterable[Path]) -> tuple[Results, set[str]]:
         result = content["result"]
         results[Panel(result["n_blocks"], result["prediction_type"])][result["planner"]].append(result)
         commits.add(content["run"]["git_commit"])
+    for panel, planners in results.items():
+        cells = [cell for seeds in planners.values() for cell in seeds]
+        protocols = {(cell["curve"][-1]["step"], cell["batch_size"], cell["starts"]) for cell in cells}
+        if len(protocols) > 1:
+            raise ValueError(f"{panel.title}: cells of different (steps, batch size, starts): {sorted(protocols)}")
     return dict(sorted(results.items())), commits
 
 
@@ -128,6 +137,6 @@ def write_report(files: Iterable[Path]) -> None:
     results, commits = read_results(files)
     if not results:
         raise SystemExit("no cell of the comparison is finished yet")
-    write_plot(results)
     write_table(results, commits)
+    write_plot(results)
     print(f"{TABLE}\n{PLOT}")

@@ -106,9 +106,8 @@ class Denoiser(nn.Module):
         self.motion_head = nn.Linear(width, action_dim)
         if self.models_symbols:
             self.embed_symbols = nn.Linear(symbol_states, width)
-        if self.embeds_symbol_level:
-            self.embed_symbol_level = nn.Sequential(nn.Linear(1, width), nn.Mish(), nn.Linear(width, width))
-        if self.models_symbols:
+            if self.embeds_symbol_level:
+                self.embed_symbol_level = nn.Sequential(nn.Linear(1, width), nn.Mish(), nn.Linear(width, width))
             self.symbol_head = nn.Linear(width, vocabulary_size)
         self.positions = nn.Parameter(torch.empty(1, horizon + symbolic_horizon, width))
 

@@ -13,8 +13,8 @@ from .conftest import N_EPISODES
 
 PROTOCOL = Protocol(
     num_episodes=N_EPISODES,
-    steps={2: 4},
-    evaluate_every={2: 2},
+    steps=4,
+    evaluate_every=2,
     starts=2,
     batch_size=10,
     network={"num_layers": 1, "num_heads": 2, "width": 32, "num_inference_steps": 3, "dropout": 0.2},
