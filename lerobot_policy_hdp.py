@@ -2,6 +2,7 @@
 
 import gym_hdp_tasks.env_config
 import lerobot_hdp.baselines.configuration_ablations
+import lerobot_hdp.baselines.configuration_hierarchical
 import lerobot_hdp.configuration_hdp
 import lerobot_hdp.processor_hdp
 from lerobot_hdp.lerobot_workarounds import keep_data_order_on_resume, shorten_torchcodec_warning

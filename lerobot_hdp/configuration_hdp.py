@@ -41,7 +41,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "optimizer_lr": 1e-4,
         "scheduler_warmup_steps": 1000,
         "sampler": "ddpm",
-        "num_inference_steps": 100,
     },
 }
 """Values of the fields that are None until a preset fills them."""
@@ -84,7 +83,7 @@ class HDPConfig(PreTrainedConfig):
             random. `ddim` draws the motion's noise at the start only. `confidence` does so too, and reveals symbols as
             soon as the planner is sure of them, which needs far fewer steps.
         confidence_threshold: how probable a symbol must be for the `confidence` sampler to reveal it.
-        num_inference_steps: network calls for a plan.
+        num_inference_steps: network calls for a plan; N where the preset says nothing else.
 
         compile_model, compile_mode: run the denoiser through `torch.compile`.
         dtype: `float32`, or `bfloat16` for autocast in training and planning.
@@ -152,6 +151,8 @@ class HDPConfig(PreTrainedConfig):
         for name, value in PRESETS[self.preset].items():
             if getattr(self, name) is None:
                 setattr(self, name, value)
+        if self.num_inference_steps is None:
+            self.num_inference_steps = self.num_train_timesteps
         _check_choice("plan_from", self.plan_from, ["episode_start", "any_frame"])
         _check_choice("prediction_type", self.prediction_type, ["epsilon", "sample", "v_prediction"])
         _check_choice("sampler", self.sampler, SAMPLERS)
@@ -166,7 +167,7 @@ class HDPConfig(PreTrainedConfig):
                 raise ParsingError(f"{name} must be at least 1, got {value}")
         if self.horizon and self.n_action_steps and self.n_action_steps > self.horizon:
             raise ParsingError(f"n_action_steps={self.n_action_steps} is more than the plan has ({self.horizon=})")
-        if self.num_inference_steps and self.num_inference_steps > self.num_train_timesteps:
+        if self.num_inference_steps > self.num_train_timesteps:
             raise ParsingError(
                 f"num_inference_steps={self.num_inference_steps} is more than {self.num_train_timesteps=}"
             )

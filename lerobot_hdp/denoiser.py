@@ -84,9 +84,8 @@ class Denoiser(nn.Module):
         self.motion_head = nn.Linear(width, action_dim)
         if self.models_symbols:
             self.embed_symbols = nn.Linear(symbol_states, width)
-        if self.embeds_symbol_level:
-            self.embed_symbol_level = nn.Sequential(nn.Linear(1, width), nn.Mish(), nn.Linear(width, width))
-        if self.models_symbols:
+            if self.embeds_symbol_level:
+                self.embed_symbol_level = nn.Sequential(nn.Linear(1, width), nn.Mish(), nn.Linear(width, width))
             self.symbol_head = nn.Linear(width, vocabulary_size)
         self.positions = nn.Parameter(torch.empty(1, horizon + symbolic_horizon, width))
 
@@ -125,7 +124,7 @@ class Denoiser(nn.Module):
 
         condition = torch.cat([torch.stack(levels, dim=1), observation], dim=1) + self.condition_positions
         memory = self.condition_encoder(condition)
-        with _attention_kernels(memory):
+        with _attention_kernels(memory.device):
             hidden = self.decoder(torch.cat(plan, dim=1) + self.positions, memory)
 
         motion_prediction = self.motion_head(hidden[:, : self.horizon])
@@ -142,9 +141,9 @@ class Denoiser(nn.Module):
         return [{"params": decay}, {"params": no_decay, "weight_decay": 0.0}]
 
 
-def _attention_kernels(value: Tensor) -> AbstractContextManager:
+def _attention_kernels(device: torch.device) -> AbstractContextManager:
     """PyTorch's choice, but for bfloat16 training on a CPU, where its fused kernel has a slow backward pass."""
-    if value.device.type == "cpu" and value.dtype == torch.bfloat16 and torch.is_grad_enabled():
+    if device.type == "cpu" and torch.is_autocast_enabled("cpu") and torch.is_grad_enabled():
         return sdpa_kernel(SDPBackend.MATH)
     return nullcontext()
 

@@ -44,6 +44,14 @@ class Planner(nn.Module):
             dropout=config.dropout,
         )
 
+    @property
+    def denoisers(self) -> list[Denoiser]:
+        return [self.denoiser]
+
+    def parameter_groups(self) -> list[dict]:
+        """For an optimizer."""
+        return [{"params": list(self.encoder.parameters())}, *self.denoiser.parameter_groups()]
+
 
 class HDPPolicy(PreTrainedPolicy):
     """Hybrid Diffusion Planner (Høeg et al. 2026): denoises a motion and the symbolic plan behind it at once.
@@ -67,19 +75,19 @@ class HDPPolicy(PreTrainedPolicy):
         self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
         self.motion_process, self.symbol_process = make_processes(config)
 
-        self.planner = Planner(config, self.symbol_process.num_states if self.symbol_process else 0)
+        self.planner = self._make_planner()
         self.ema = _moving_average(self.planner, config) if config.ema_max_decay > 0 else None
         if config.compile_model:
             for network in {self.planner, self._planning_network}:
-                network.denoiser.compile(mode=config.compile_mode)
+                for denoiser in network.denoisers:
+                    denoiser.compile(mode=config.compile_mode)
         # Training noise is a function of these two, so that a resumed run goes on exactly as if never interrupted.
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
         self.register_buffer("forward_calls", torch.tensor(0))
         self.reset()
 
     def get_optim_params(self) -> list[dict]:
-        encoder = {"params": list(self.planner.encoder.parameters())}
-        return [encoder, *self.planner.denoiser.parameter_groups()]
+        return self.planner.parameter_groups()
 
     def reset(self) -> None:
         """Forget the plan in execution. To be called on `env.reset()`."""
@@ -105,6 +113,9 @@ class HDPPolicy(PreTrainedPolicy):
         with torch.random.fork_rng(devices=self._cuda_devices):
             torch.manual_seed(_step_seed(int(self.noise_seed), int(self.forward_calls)))
             return self._loss(batch, self.planner)
+
+    def _make_planner(self) -> Planner:
+        return Planner(self.config, self.symbol_process.num_states if self.symbol_process else 0)
 
     def _loss(self, batch: dict[str, Tensor], network: Planner) -> tuple[Tensor, dict[str, float]]:
         motion = batch[ACTION]
@@ -150,11 +161,17 @@ class HDPPolicy(PreTrainedPolicy):
                 raise ValueError(f"{key} holds NaN or infinity: no plan can be made from it")
         if prompt is None and OBS_SYMBOLIC_PLAN in batch and self.symbol_process is not None:
             prompt = PlanPrompt(token_ids=batch[OBS_SYMBOLIC_PLAN])
-        batch_size, device = len(batch[self.planner.encoder.keys[0]]), self.noise_seed.device
-        motion_shape = (batch_size, self.config.horizon, self.config.action_feature.shape[0])
-        self._check_prompt(prompt, motion_shape)
+        self._check_prompt(prompt, self._motion_shape(batch))
+        return self._sample(batch, prompt, generator, on_step)
 
-        network = self._planning_network
+    def _sample(
+        self,
+        batch: dict[str, Tensor],
+        prompt: PlanPrompt | None,
+        generator: Generator | None,
+        on_step: Callable[[int, DenoisingState], None] | None,
+    ) -> Plan:
+        network, device = self._planning_network, self.noise_seed.device
         observation = network.encoder(batch)
 
         def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
@@ -166,7 +183,7 @@ class HDPPolicy(PreTrainedPolicy):
             denoise,
             self.motion_process,
             self.symbol_process,
-            motion_shape,
+            self._motion_shape(batch),
             self.config.symbolic_horizon or 0,
             device,
             self.config.num_inference_steps,
@@ -193,6 +210,11 @@ class HDPPolicy(PreTrainedPolicy):
     def _planning_network(self) -> Planner:
         """The averaged weights, where there are any."""
         return self.planner if self.ema is None else self.ema.module
+
+    def _motion_shape(self, batch: dict[str, Tensor]) -> tuple[int, int, int]:
+        """(B, H_c, D)."""
+        batch_size = len(batch[next(iter(self.config.input_features))])
+        return batch_size, self.config.horizon, self.config.action_feature.shape[0]
 
     @property
     def _cuda_devices(self) -> list[torch.device]:

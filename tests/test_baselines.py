@@ -1,21 +1,43 @@
 """The contract that every planner keeps, and what each baseline does differently."""
 
+import json
+import shutil
+import sys
+
 import pytest
 import torch
+from draccus.utils import ParsingError
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
+from lerobot.scripts import lerobot_eval, lerobot_train
+from safetensors.torch import load_file
 
 from lerobot_hdp import FREE, PlanPrompt
 
-from .conftest import HORIZON
+from .conftest import HORIZON, TASK_FLAGS, TINY_PLANNER
 
 CONTINUOUS_SYMBOLS = ["joint_diffuser", "separate_diffuser"]
 WITH_SYMBOLS = ["hdp", *CONTINUOUS_SYMBOLS]
-PLANNERS = [*WITH_SYMBOLS, "diffuser"]
+HIERARCHICAL = ["hd", "chd"]
+PLANNERS = [*WITH_SYMBOLS, "diffuser", *HIERARCHICAL]
 
 
 def observation(batch):
     return {key: value for key, value in batch.items() if key in ("observation.state", "observation.environment_state")}
+
+
+@pytest.fixture
+def training_batch(dataset):
+    """Training samples of four episodes, in the windows that a policy asks LeRobot for: `training_batch(policy)`."""
+
+    def load(policy):
+        windows = resolve_delta_timestamps(policy.config, dataset.meta)
+        windowed = LeRobotDataset("test/sorting", root=dataset.root, delta_timestamps=windows, video_backend="pyav")
+        return torch.utils.data.default_collate([windowed[episode * HORIZON] for episode in range(4)])
+
+    return load
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -44,10 +66,10 @@ class TestContract:
         assert not torch.equal(plans[0], plans[2])
 
     @pytest.mark.parametrize("prediction_type", ["sample", "epsilon"])
-    def test_every_part_of_the_loss_falls(self, make_planner, batch, planner, prediction_type):
+    def test_every_part_of_the_loss_falls(self, make_planner, training_batch, planner, prediction_type):
         policy, preprocessor, _ = make_planner(planner, prediction_type=prediction_type)
         optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
-        inputs, history = preprocessor(batch), []
+        inputs, history = preprocessor(training_batch(policy)), []
         policy.train()
         for _ in range(60):
             loss, parts = policy.forward(inputs)
@@ -59,9 +81,11 @@ class TestContract:
             first, last = (sum(parts[name] for parts in part) for part in (history[:10], history[-10:]))
             assert last < 0.8 * first
 
-    def test_every_trainable_parameter_gets_a_gradient_and_is_optimised_once(self, make_planner, batch, planner):
+    def test_every_trainable_parameter_gets_a_gradient_and_is_optimised_once(
+        self, make_planner, training_batch, planner
+    ):
         policy, preprocessor, _ = make_planner(planner)
-        policy.train().forward(preprocessor(batch))[0].backward()
+        policy.train().forward(preprocessor(training_batch(policy)))[0].backward()
         trainable = [p for p in policy.parameters() if p.requires_grad]
         assert all(p.grad is not None for p in trainable)
         optimised = [id(p) for group in policy.get_optim_params() for p in group["params"]]
@@ -80,10 +104,10 @@ class TestContract:
         assert torch.equal(plans[0].actions, plans[1].actions)
         assert plans[0].symbols() == plans[1].symbols()
 
-    def test_the_noise_of_a_training_step_is_in_the_checkpoint(self, make_planner, batch, planner, tmp_path):
+    def test_the_noise_of_a_training_step_is_in_the_checkpoint(self, make_planner, training_batch, planner, tmp_path):
         """So that a resumed run goes on exactly as if never interrupted."""
         policy, preprocessor, _ = make_planner(planner, dropout=0.5)
-        inputs = preprocessor(batch)
+        inputs = preprocessor(training_batch(policy))
         policy.train().forward(inputs)
         policy.save_pretrained(tmp_path)
         resumed = get_policy_class(planner).from_pretrained(tmp_path).train()
@@ -109,14 +133,80 @@ class TestContract:
         assert torch.equal(plan.actions[:, :7], inputs["action"][:, :7])
         assert not torch.equal(plan.actions[:, 7:], inputs["action"][:, 7:])
 
-    def test_bfloat16_can_be_switched_on(self, make_planner, batch, planner):
+    def test_bfloat16_can_be_switched_on(self, make_planner, batch, training_batch, planner):
         policy, preprocessor, _ = make_planner(planner, dtype="bfloat16")
-        inputs = preprocessor(batch)
+        inputs = preprocessor(training_batch(policy))
         with torch.autocast("cpu", torch.bfloat16):
             loss, _ = policy.train().forward(inputs)
         loss.backward()
         assert torch.isfinite(loss)
-        assert policy.eval().plan(observation(inputs)).actions.dtype == torch.float32
+        assert policy.eval().plan(observation(preprocessor(batch))).actions.dtype == torch.float32
+
+    def test_all_of_the_motion_can_be_given(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = preprocessor(batch)
+        plan = policy.eval().plan(observation(inputs), PlanPrompt(actions=inputs["action"]))
+        assert torch.equal(plan.actions, inputs["action"])
+
+    def test_every_step_of_planning_can_be_watched(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        states = []
+        plan = policy.eval().plan(observation(preprocessor(batch)), on_step=lambda i, state: states.append((i, state)))
+        assert [i for i, _ in states] == list(range(11))
+        assert all(state.motion.shape == (4, HORIZON, 3) for _, state in states)
+        assert torch.equal(states[-1][1].motion, plan.actions)
+
+    def test_lerobot_trains_resumes_and_evaluates_it(self, dataset_root, planner, tmp_path, monkeypatch):
+        """LeRobot's own commands, called in this process to save their start."""
+
+        def run(command, *arguments):
+            monkeypatch.setattr(sys, "argv", [command.__module__, *map(str, arguments)])
+            command()
+
+        whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+        run(
+            lerobot_train.main,
+            "--dataset.repo_id=test/sorting",
+            f"--dataset.root={dataset_root}",
+            "--dataset.video_backend=pyav",
+            f"--policy.type={planner}",
+            *(f"--policy.{name}={value}" for name, value in TINY_PLANNER.items()),
+            "--policy.dropout=0.3",
+            "--policy.push_to_hub=false",
+            "--policy.device=cpu",
+            f"--output_dir={whole}",
+            "--batch_size=8",
+            "--steps=8",
+            "--save_freq=5",
+            "--num_workers=0",
+            "--env.type=hdp",
+            *TASK_FLAGS,
+            "--env_eval_freq=0",
+        )
+        shutil.copytree(whole / "checkpoints/000005", stopped / "checkpoints/000005")
+        (stopped / "checkpoints/last").symlink_to("000005")
+        config = stopped / "checkpoints/last/pretrained_model/train_config.json"
+        run(lerobot_train.main, f"--config_path={config}", "--resume=true", f"--output_dir={stopped}")
+        checkpoint = stopped / "checkpoints/000008/pretrained_model"
+        first, second = (
+            load_file(run_dir / "checkpoints/000008/pretrained_model/model.safetensors") for run_dir in (whole, stopped)
+        )
+        assert first.keys() == second.keys()
+        assert all(torch.equal(first[key], second[key]) for key in first)
+
+        run(
+            lerobot_eval.main,
+            f"--policy.path={checkpoint}",
+            "--env.type=hdp",
+            *TASK_FLAGS,
+            "--eval.n_episodes=2",
+            "--eval.batch_size=2",
+            "--eval.use_async_envs=false",
+            f"--output_dir={tmp_path / 'eval'}",
+        )
+        overall = json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]
+        assert overall["n_episodes"] == 2
+        assert 0 <= overall["pc_success"] <= 100
 
     def test_nan_in_an_observation_is_refused(self, make_planner, batch, planner):
         policy, preprocessor, _ = make_planner(planner)
@@ -199,21 +289,72 @@ class TestLevels:
         assert all("embed_symbol_level" in name for name in extra)
 
 
-class TestDiffuser:
-    def test_needs_no_symbols(self, dataset, make_planner, batch):
-        config = make_planner("diffuser")[0].config
+@pytest.mark.parametrize("planner", ["diffuser", *HIERARCHICAL])
+class TestWithoutSymbols:
+    def test_needs_none_in_the_dataset(self, dataset, make_planner, planner):
+        config = make_planner(planner)[0].config
         assert config.vocabulary is None
         features = {k: v for k, v in dataset.meta.features.items() if k != "observation.symbolic_plan"}
         config.set_dataset_feature_metadata(features)
         config.validate_features()
 
-    def test_takes_no_symbolic_prompt(self, make_planner, batch):
-        policy, preprocessor, _ = make_planner("diffuser")
+    def test_takes_no_symbolic_prompt(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
         prompt = PlanPrompt(token_ids=torch.zeros(4, 18, dtype=torch.int64))
         with pytest.raises(ValueError, match="models no symbols"):
             policy.eval().plan(observation(preprocessor(batch)), prompt)
 
-    def test_hdp_adds_about_one_percent_of_parameters_to_it(self, make_planner):
+
+@pytest.mark.parametrize("planner", HIERARCHICAL)
+class TestHierarchical:
+    """19 actions are 5 segments of 4."""
+
+    def test_lerobot_loads_just_the_frames_of_the_subgoals(self, make_planner, training_batch, dataset, planner):
+        policy, *_ = make_planner(planner)
+        sample = training_batch(policy)
+        frames = [0, 4, 8, 12, 16, 18]  # there is no frame 20: LeRobot repeats the last one
+        for key in policy.config.input_features:
+            expected = torch.stack([dataset[frame][key] for frame in frames])
+            assert torch.equal(sample[key][0], expected)
+        assert sample["action"].shape == (4, 20, 3)
+        assert torch.equal(sample["action"][:, 19], sample["action"][:, 18])
+
+    def test_segments_are_what_lies_between_subgoals(self, make_planner, training_batch, planner):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = preprocessor(training_batch(policy))
+        segments = policy._to_segments(inputs["action"])
+        assert torch.equal(segments[5 + 1], inputs["action"][1, 4:8])
+        assert torch.equal(policy._to_motion(segments), inputs["action"][:, :HORIZON])
+
+    def test_a_segment_depends_on_its_own_two_subgoals(self, make_planner, planner):
+        network = make_planner(planner)[0].planner.eval()
+        state, subgoals, segments = torch.rand(1, 7), torch.rand(1, 5, 7), torch.rand(5, 4, 3)
+        level = torch.full((5,), 0.5)
+        before = network.denoise_segments(segments, state, subgoals, level)
+        subgoals[0, 2] += 1
+        changed = (network.denoise_segments(segments, state, subgoals, level) != before).flatten(1).any(dim=1)
+        assert changed.tolist() == [False, False, True, True, False]
+
+    def test_only_coupled_levels_pass_feedback_upstream(self, make_planner, batch, planner):
+        """A given motion changes the sub-goals, where the levels are coupled."""
+        policy, preprocessor, _ = make_planner(planner)
+        inputs, predicted = preprocessor(batch), []
+        policy.eval()._planning_network.high.register_forward_hook(lambda *io: predicted.append(io[2].motion))
+        for action in (inputs["action"], -inputs["action"]):
+            policy.plan(observation(inputs), PlanPrompt(actions=action), torch.Generator().manual_seed(0))
+        first, second = predicted[:10], predicted[10:]
+        assert torch.equal(first[-1], second[-1]) == (planner == "hd")
+
+    def test_the_interval_is_the_users_choice(self, make_planner, batch, planner):
+        policy, preprocessor, _ = make_planner(planner, subgoal_interval=7)
+        assert policy.config.observation_delta_indices == [0, 7, 14, 21]
+        assert policy.eval().plan(observation(preprocessor(batch))).actions.shape == (4, HORIZON, 3)
+        with pytest.raises(ParsingError, match="subgoal_interval must be at least 1"):
+            make_planner(planner, subgoal_interval=0)
+
+
+class TestSizes:
+    def test_hdp_adds_about_one_percent_of_parameters_to_diffuser(self, make_planner):
         """The paper: 'an increase in parameter count by about 1 %'."""
         sizes = {"num_layers": 8, "num_heads": 4, "width": 256, "preset": "paper"}
         hybrid, motion_only = (

@@ -1,0 +1,150 @@
+"""How long each planner takes to make a plan, and how many parameters it has, side by side on one machine.
+
+python -m benchmarks.planner_latency
+
+Writes `benchmarks/results/planner_latency.json` and, from it, `docs/planner_latency.md`. Networks have the paper's size
+and random weights. Every round times each planner once, in a new order, so that whatever else the machine does falls on
+all of them; a ratio compares two times of the same round. A plan takes `--num_inference_steps` network calls on each
+level of a planner, fewer than the paper's 100: the ratios depend little on their number.
+"""
+
+import argparse
+import json
+import random
+import statistics
+import time
+from pathlib import Path
+
+import torch
+from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.policies.factory import get_policy_class
+from lerobot.utils.feature_utils import dataset_to_policy_features
+from torch import Tensor
+
+import lerobot_policy_hdp  # noqa: F401 (registers the planners)
+from dataset_tools.record import RecordConfig, RecordDatasetConfig, dataset_features
+from gym_hdp_tasks.env_config import HDPEnv
+from lerobot_hdp.modeling_hdp import HDPPolicy
+
+from .machine import describe_run
+
+RESULTS = Path(__file__).parent / "results" / "planner_latency.json"
+TABLE = Path("docs/planner_latency.md")
+PLANNERS = ("diffuser", "hdp", "joint_diffuser", "separate_diffuser", "hd", "chd")
+REFERENCE = "diffuser"
+PAPER_SYMBOLIC_HORIZON = 108
+"""H_d of the paper's sorting tasks, filled with PAD."""
+
+
+def make_planner(policy_type: str, env: HDPEnv, **options) -> HDPPolicy:
+    """A planner for a task, with random weights and without a dataset."""
+    columns = dataset_features(RecordConfig(RecordDatasetConfig("local/none"), env))
+    features = dataset_to_policy_features(columns)
+    config = PreTrainedConfig.get_choice_class(policy_type)(horizon=env.planning_task.horizon, **options)
+    config.input_features = {k: f for k, f in features.items() if f.type in (FeatureType.STATE, FeatureType.ENV)}
+    config.output_features = {k: f for k, f in features.items() if f.type is FeatureType.ACTION}
+    config.set_dataset_feature_metadata(columns)
+    return get_policy_class(policy_type)(config).to(config.device).eval()
+
+
+def num_parameters(policy: HDPPolicy) -> int:
+    """Parameters of the network that is trained, without their moving average."""
+    return sum(parameter.numel() for parameter in policy.planner.parameters())
+
+
+def time_plan(policy: HDPPolicy, batch: dict[str, Tensor]) -> float:
+    """Seconds that a batch of plans takes."""
+    start = time.perf_counter()
+    policy.plan(batch).actions.sum().item()  # waits for an accelerator
+    return time.perf_counter() - start
+
+
+def measure(planners: dict[str, HDPPolicy], batch_size: int, rounds: int) -> dict[str, dict[str, object]]:
+    """Milliseconds of each planner, and their ratios over the reference, as [first quartile, median, third]."""
+    policy = planners[REFERENCE]
+    batch = {
+        key: torch.rand(batch_size, *feature.shape, device=policy.config.device) * 2 - 1
+        for key, feature in policy.config.input_features.items()
+    }
+    times: dict[str, list[float]] = {name: [] for name in planners}
+    for round_number in range(rounds + 1):
+        for name in random.sample(list(planners), len(planners)):
+            elapsed = time_plan(planners[name], batch)
+            if round_number:  # the first round warms up
+                times[name].append(elapsed)
+
+    def quartiles(values: list[float], digits: int) -> list[float]:
+        return [round(value, digits) for value in statistics.quantiles(values, n=4, method="inclusive")]
+
+    return {
+        name: {
+            "ms": quartiles([1000 * elapsed for elapsed in own], 1),
+            "ratio": quartiles([a / b for a, b in zip(own, times[REFERENCE], strict=True)], 3),
+        }
+        for name, own in times.items()
+    }
+
+
+def write_table() -> None:
+    """Write the page from the results file."""
+    content = json.loads(RESULTS.read_text())
+    run, result = content["run"], content["result"]
+    sizes = result["batch_size"]
+    lines = [
+        "# Size and latency of the planners",
+        "",
+        f"Written by `{run['command']}` (code of {run['git_commit']}) on {result['device']} ({run['cpu']}, "
+        f"{result['threads']} thread of PyTorch), for `{result['task']}`: {result['num_layers']} layers of width "
+        f"{result['width']}, {result['num_inference_steps']} steps a plan. Median and quartiles of {result['rounds']} "
+        "rounds; a ratio compares two times of the same round.",
+        "",
+        "| planner | parameters | over Diffuser |" + "".join(f" batch {n}, ms | over Diffuser |" for n in sizes),
+        "|---|---|---|" + "---|---|" * len(sizes),
+    ]
+    for name in PLANNERS:
+        cells = [f"`{name}`", f"{result['parameters'][name]:,}", f"{result['parameter_ratio'][name] - 1:+.1%}"]
+        for measured in sizes.values():
+            for low, middle, high in (measured[name]["ms"], measured[name]["ratio"]):
+                cells.append(f"{middle:g} ({low:g} to {high:g})")
+        lines.append(f"| {' | '.join(cells)} |")
+    TABLE.write_text("\n".join(lines) + "\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="XArmSorting-v0")
+    parser.add_argument("--batch_sizes", type=int, nargs="+", default=[1, 50])
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--num_inference_steps", type=int, default=5)
+    parser.add_argument("--num_layers", type=int, default=8)
+    parser.add_argument("--width", type=int, default=256)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=1, help="of PyTorch, on a CPU")
+    options = parser.parse_args()
+
+    torch.set_num_threads(options.threads)
+    env = HDPEnv(task=options.task)
+    sizes = {name: getattr(options, name) for name in ("num_layers", "width", "num_inference_steps", "device")}
+    planners = {}
+    for name in PLANNERS:
+        config_class = PreTrainedConfig.get_choice_class(name)
+        symbols = {"symbolic_horizon": PAPER_SYMBOLIC_HORIZON} if config_class.symbol_process else {}
+        planners[name] = make_planner(name, env, preset="paper", **sizes, **symbols)
+
+    parameters = {name: num_parameters(policy) for name, policy in planners.items()}
+    result = {
+        "task": env.gym_id,
+        **sizes,
+        "threads": options.threads,
+        "rounds": options.rounds,
+        "parameters": parameters,
+        "parameter_ratio": {name: round(n / parameters[REFERENCE], 4) for name, n in parameters.items()},
+        "batch_size": {size: measure(planners, size, options.rounds) for size in options.batch_sizes},
+    }
+    RESULTS.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+    write_table()
+    print(TABLE.read_text())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,251 @@
+"""Hierarchical Diffuser and Coupled Hierarchical Diffuser as LeRobot policies.
+
+Shapes: B samples, M segments of K actions of size D, sub-goals of size S. A sub-goal is all that is observed, in one
+vector.
+"""
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from lerobot.utils.constants import ACTION
+from torch import Generator, Tensor, nn
+
+from ..denoiser import Denoiser, Prediction
+from ..encoders import StateEncoder
+from ..modeling_hdp import HDPPolicy
+from ..plan import Plan, PlanPrompt
+from ..sampling import DenoisingState, Stream, sample_plan
+from .configuration_hierarchical import CoupledHierarchicalDiffuserConfig, HierarchicalDiffuserConfig
+
+
+class HierarchicalPlanner(nn.Module):
+    """Two denoisers, of sub-goals and of segments, and the encoders of what each is conditioned on."""
+
+    def __init__(self, config: HierarchicalDiffuserConfig):
+        super().__init__()
+        observed = config.observation_token_sizes
+        segment_size = config.subgoal_interval * config.action_feature.shape[0]
+
+        def encoder(token_sizes: list[int]) -> StateEncoder:
+            return StateEncoder(["state"], token_sizes, config.width, config.observation_weight_std)
+
+        def denoiser(value_size: int, horizon: int, condition_tokens: int) -> Denoiser:
+            return Denoiser(
+                action_dim=value_size,
+                horizon=horizon,
+                observation_tokens=condition_tokens,
+                num_train_timesteps=config.num_train_timesteps,
+                vocabulary_size=0,
+                symbolic_horizon=0,
+                symbol_states=0,
+                shared_level=config.shared_level,
+                num_layers=config.num_layers,
+                num_heads=config.num_heads,
+                width=config.width,
+                dropout=config.dropout,
+            )
+
+        self.encode_observation = encoder(observed)
+        self.encode_ends = encoder([*observed, *observed])
+        self.encode_segments = encoder([segment_size] * config.num_segments) if config.coupled else None
+        high_tokens = len(observed) + (config.num_segments if config.coupled else 0)
+        self.high = denoiser(sum(observed), config.num_segments, high_tokens)
+        self.low = denoiser(config.action_feature.shape[0], config.subgoal_interval, 2 * len(observed))
+
+    def denoise_subgoals(self, subgoals: Tensor, state: Tensor, level: Tensor, segments: Tensor | None) -> Tensor:
+        """The high level's prediction.
+
+        Args:
+            subgoals: (B, M, S) noisy sub-goals.
+            state: (B, S) what is observed now.
+            level: (B,).
+            segments: (B M, K, D) noisy segments, where the levels are coupled.
+        """
+        condition = self.encode_observation({"state": state})
+        if self.encode_segments is not None:
+            feedback = self.encode_segments({"state": segments.reshape(len(state), -1)})
+            condition = torch.cat([condition, feedback], dim=1)
+        return self.high(subgoals, None, condition, level, level).motion
+
+    def denoise_segments(self, segments: Tensor, state: Tensor, subgoals: Tensor, level: Tensor) -> Tensor:
+        """The low level's prediction.
+
+        Args:
+            segments: (B M, K, D) noisy segments.
+            state: (B, S) what is observed now, where the first segment begins.
+            subgoals: (B, M, S) where each segment ends and the next one begins.
+            level: (B M,).
+        """
+        points = torch.cat([state[:, None], subgoals], dim=1)
+        ends = torch.cat([points[:, :-1], points[:, 1:]], dim=-1).flatten(0, 1)
+        return self.low(segments, None, self.encode_ends({"state": ends}), level, level).motion
+
+    @property
+    def denoisers(self) -> list[Denoiser]:
+        return [self.high, self.low]
+
+    def parameter_groups(self) -> list[dict]:
+        """For an optimizer."""
+        encoders = [self.encode_observation, self.encode_ends, self.encode_segments]
+        parameters = [parameter for encoder in encoders if encoder is not None for parameter in encoder.parameters()]
+        return [{"params": parameters}, *self.high.parameter_groups(), *self.low.parameter_groups()]
+
+
+class HierarchicalDiffuserPolicy(HDPPolicy):
+    """Plans sub-goals, then the segments between them."""
+
+    config_class = HierarchicalDiffuserConfig
+    name = "hd"
+
+    def _make_planner(self) -> HierarchicalPlanner:
+        return HierarchicalPlanner(self.config)
+
+    def _states(self, batch: dict[str, Tensor]) -> Tensor:
+        """What is observed now and, in training, the sub-goals: (B, 1 or 1 + M, S)."""
+        observations = [batch[key] for key in self.config.input_features]
+        return torch.cat([value if value.ndim == 3 else value[:, None] for value in observations], dim=-1)
+
+    def _to_segments(self, motion: Tensor) -> Tensor:
+        """(B, M K, ...) -> (B M, K, ...)."""
+        return motion.unflatten(1, (self.config.num_segments, self.config.subgoal_interval)).flatten(0, 1)
+
+    def _to_motion(self, segments: Tensor) -> Tensor:
+        """(B M, K, D) -> (B, H_c, D)."""
+        return segments.unflatten(0, (-1, self.config.num_segments)).flatten(1, 2)[:, : self.config.horizon]
+
+    def _segments_prompt(self, prompt: PlanPrompt | None) -> PlanPrompt:
+        """The given part of the motion, cut into segments."""
+        if prompt is None or prompt.actions is None:
+            return PlanPrompt()
+        missing = self.config.num_segments * self.config.subgoal_interval - self.config.horizon
+        given = F.pad(prompt.actions_mask.expand_as(prompt.actions[..., :1]), (0, 0, 0, missing))
+        actions = F.pad(prompt.actions, (0, 0, 0, missing))
+        return PlanPrompt(actions=self._to_segments(actions), actions_given=self._to_segments(given)[..., 0])
+
+    def _loss(self, batch: dict[str, Tensor], network: HierarchicalPlanner) -> tuple[Tensor, dict[str, float]]:
+        """Each level's squared error; the low level is trained on the demonstration's own sub-goals."""
+        process, device = self.motion_process, self.noise_seed.device
+        states, segments = self._states(batch), self._to_segments(batch[ACTION])
+        state, subgoals = states[:, 0], states[:, 1:]
+
+        noisy_subgoals = process.corrupt(subgoals, process.sample_level(len(subgoals), device))
+        prediction = network.denoise_subgoals(noisy_subgoals.value, state, noisy_subgoals.level, None)
+        subgoal_loss = process.loss(prediction, noisy_subgoals).mean()
+
+        noisy_segments = process.corrupt(segments, process.sample_level(len(segments), device))
+        prediction = network.denoise_segments(noisy_segments.value, state, subgoals, noisy_segments.level)
+        motion_loss = process.loss(prediction, noisy_segments).mean()
+        return subgoal_loss + motion_loss, {"subgoal_loss": subgoal_loss.item(), "motion_loss": motion_loss.item()}
+
+    def _sample(
+        self,
+        batch: dict[str, Tensor],
+        prompt: PlanPrompt | None,
+        generator: Generator | None,
+        on_step: Callable[[int, DenoisingState], None] | None,
+    ) -> Plan:
+        """`on_step` sees the steps of the low level."""
+        network, state = self._planning_network, self._states(batch)[:, 0]
+        batch_size, _, action_dim = self._motion_shape(batch)
+        config, device = self.config, state.device
+
+        def sample(denoise: Callable[[Tensor, Tensor], Tensor], shape: tuple[int, int, int], **kwargs) -> Tensor:
+            def denoise_alone(value: Tensor, _: None, level: Tensor, __: Tensor) -> Prediction:
+                with torch.autocast(device.type, torch.bfloat16, enabled=config.dtype == "bfloat16"):
+                    return Prediction(denoise(value, level).float(), None)
+
+            process, steps = self.motion_process, self.config.num_inference_steps
+            return sample_plan(
+                denoise_alone, process, None, shape, 0, device, steps, generator=generator, **kwargs
+            ).motion
+
+        subgoals = sample(
+            lambda value, level: network.denoise_subgoals(value, state, level, None),
+            (batch_size, config.num_segments, state.shape[1]),
+        )
+        segments = sample(
+            lambda value, level: network.denoise_segments(value, state, subgoals, level),
+            (batch_size * config.num_segments, config.subgoal_interval, action_dim),
+            prompt=self._segments_prompt(prompt),
+            on_step=None if on_step is None else lambda step, low: on_step(step, self._show(low.motion)),
+        )
+        return Plan(*self._show(segments))
+
+    def _show(self, segments: Tensor) -> DenoisingState:
+        """Segments as a plan without symbols."""
+        motion = self._to_motion(segments)
+        return DenoisingState(motion, None, torch.zeros(len(motion), 0, device=motion.device))
+
+
+class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
+    """Denoises sub-goals and segments together, each seeing the other."""
+
+    config_class = CoupledHierarchicalDiffuserConfig
+    name = "chd"
+
+    def _loss(self, batch: dict[str, Tensor], network: HierarchicalPlanner) -> tuple[Tensor, dict[str, float]]:
+        """Each level's squared error, at the same step k, each conditioned on the other as in planning."""
+        process, device = self.motion_process, self.noise_seed.device
+        states, segments = self._states(batch), self._to_segments(batch[ACTION])
+        state, subgoals = states[:, 0], states[:, 1:]
+        level = process.sample_level(len(state), device)
+        noisy_subgoals = process.corrupt(subgoals, level)
+        noisy_segments = process.corrupt(segments, level.repeat_interleave(self.config.num_segments))
+        high, low = self._denoise_both(network, noisy_subgoals.value, noisy_segments.value, state, level)
+        subgoal_loss = process.loss(high, noisy_subgoals).mean()
+        motion_loss = process.loss(low, noisy_segments).mean()
+        return subgoal_loss + motion_loss, {"subgoal_loss": subgoal_loss.item(), "motion_loss": motion_loss.item()}
+
+    def _denoise_both(
+        self, network: HierarchicalPlanner, subgoals: Tensor, segments: Tensor, state: Tensor, level: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The predictions of both levels.
+
+        The high level sees the noisy segments, the low level the sub-goals that the high level now has in mind: its
+        prediction of the clean ones. The low level's loss does not train the high level.
+
+        Args:
+            network: the planner.
+            subgoals: (B, M, S) noisy sub-goals.
+            segments: (B M, K, D) noisy segments.
+            state: (B, S) what is observed now.
+            level: (B,) of both.
+        """
+        high = network.denoise_subgoals(subgoals, state, level, segments)
+        current = self.motion_process.predicted_sample(subgoals, high.detach().float(), level)
+        low = network.denoise_segments(segments, state, current, level.repeat_interleave(self.config.num_segments))
+        return high, low
+
+    def _sample(
+        self,
+        batch: dict[str, Tensor],
+        prompt: PlanPrompt | None,
+        generator: Generator | None,
+        on_step: Callable[[int, DenoisingState], None] | None,
+    ) -> Plan:
+        network, state = self._planning_network, self._states(batch)[:, 0]
+        batch_size, _, action_dim = self._motion_shape(batch)
+        config, process, device = self.config, self.motion_process, state.device
+        levels = process.levels(self.config.num_inference_steps).to(device)
+
+        def start(shape: tuple[int, int, int], clean: Tensor | None = None, given: Tensor | None = None) -> Stream:
+            stream = Stream(process, process.prior(shape, device, generator), levels, clean, given, shared_level=True)
+            stream.set_given(0, generator)
+            return stream
+
+        given = self._segments_prompt(prompt)
+        subgoals = start((batch_size, config.num_segments, state.shape[1]))
+        segments = start(
+            (batch_size * config.num_segments, config.subgoal_interval, action_dim), given.actions, given.actions_mask
+        )
+        if on_step is not None:
+            on_step(0, self._show(segments.value))
+        for i in range(self.config.num_inference_steps):
+            with torch.autocast(device.type, torch.bfloat16, enabled=config.dtype == "bfloat16"):
+                high, low = self._denoise_both(network, subgoals.value, segments.value, state, subgoals.level(i))
+            subgoals.advance(i, high.float(), generator)
+            segments.advance(i, low.float(), generator)
+            if on_step is not None:
+                on_step(i + 1, self._show(segments.value))
+        return Plan(*self._show(segments.value))
