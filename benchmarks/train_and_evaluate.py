@@ -1,9 +1,10 @@
-"""Train on 2D sorting and evaluate fresh starts: HDP, and the motion alone beside it.
+"""Train planners by a train config and evaluate them on fresh starts, with the commands that users have.
 
-    python -m benchmarks.block_sorting_2d --n_blocks=3
+    python -m benchmarks.train_and_evaluate configs/xarm_sorting.json --planners hdp --name mini \\
+        --policy.num_layers=4 --policy.width=128 --steps=3000
 
-Records the dataset if it is not there, runs `hdp-train --config_path=configs/block_sorting_2d_<n>_blocks.json` and
-`lerobot-eval`, and writes `benchmarks/results/block_sorting_2d_<n>_blocks_<planner>.json`.
+Records the config's dataset if it is not there, runs `hdp-train` and `lerobot-eval`, and writes
+`benchmarks/results/<config>_<name>_<planner>.json`. Further flags go to `hdp-train`.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from .machine import describe_run
 
@@ -35,35 +37,45 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return tuple(round((centre + sign * spread) / (1 + z * z / trials), 4) for sign in (-1, 1))
 
 
-def measure(planner: str, n_blocks: int, episodes: int, seed: int) -> dict[str, object]:
-    """Train one planner and evaluate it."""
-    config = f"configs/block_sorting_2d_{n_blocks}_blocks.json"
-    task_flags = ("--env.task=BlockSorting2D-v0", f"--env.n_blocks={n_blocks}", "--env.waypoints_per_pose=1")
-    dataset = Path(json.loads(Path(config).read_text())["dataset"]["root"])
+def measure(config: Path, name: str, planner: str, episodes: int, seed: int, flags: list[str]) -> dict[str, Any]:
+    """Train one planner and evaluate it.
+
+    Args:
+        config: a train config with a dataset and an environment.
+        name: of the run, and of its folder.
+        planner: policy type.
+        episodes: fresh starts; a multiple of 50, or fewer.
+        seed: of the training; the evaluation has LeRobot's.
+        flags: more flags for `hdp-train`.
+    """
+    settings = json.loads(config.read_text())
+    task_flags = [f"--env.{key}={value}" for key, value in settings["env"].items() if key != "type"]
+    dataset = Path(settings["dataset"]["root"])
     if not dataset.exists():
         run(
             "hdp-record",
             *task_flags,
             "--resume=true",
-            f"--dataset.repo_id=local/{dataset.name}",
+            "--num_workers=2",
+            f"--dataset.repo_id={settings['dataset']['repo_id']}",
             f"--dataset.root={dataset}",
         )
-    output = OUTPUTS / f"block_sorting_2d_{n_blocks}_blocks_{planner}_seed{seed}"
-    train_s = run(
-        "hdp-train",
-        f"--config_path={config}",
-        f"--policy.type={planner}",
-        f"--output_dir={output}",
-        f"--seed={seed}",
-    )
+    output = OUTPUTS / f"{name}_{planner}_seed{seed}"
     checkpoint = output / "checkpoints" / "last" / "pretrained_model"
+    resumed = checkpoint.exists()
+    if resumed:
+        train_flags = ["--resume=true", f"--config_path={checkpoint / 'train_config.json'}"]
+    else:
+        train_flags = [f"--config_path={config}", f"--policy.type={planner}", f"--output_dir={output}", *flags]
+        train_flags += [f"--seed={seed}"]
+    train_s = run("hdp-train", *train_flags)
     run(
         "lerobot-eval",
         f"--policy.path={checkpoint}",
         "--env.type=hdp",
         *task_flags,
         f"--eval.n_episodes={episodes}",
-        "--eval.batch_size=50",
+        f"--eval.batch_size={min(episodes, 50)}",
         "--eval.use_async_envs=false",
         f"--output_dir={output / 'eval'}",
     )
@@ -73,7 +85,7 @@ def measure(planner: str, n_blocks: int, episodes: int, seed: int) -> dict[str, 
     return {
         "planner": planner,
         "seed": seed,
-        "train_minutes": round(train_s / 60, 1),
+        "train_minutes": None if resumed else round(train_s / 60, 1),
         "steps": json.loads((checkpoint / "train_config.json").read_text())["steps"],
         "episodes": episodes,
         "success_rate": successes / episodes,
@@ -82,21 +94,19 @@ def measure(planner: str, n_blocks: int, episodes: int, seed: int) -> dict[str, 
     }
 
 
-PLANNERS = ("hdp", "diffuser")
-"""Policy types."""
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--n_blocks", type=int, default=3)
-    parser.add_argument("--planners", nargs="+", choices=PLANNERS, default=PLANNERS)
+    parser.add_argument("config", type=Path)
+    parser.add_argument("--name", help="of a variant that other flags make of the config")
+    parser.add_argument("--planners", nargs="+", default=["hdp", "diffuser"])
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1000)
-    options = parser.parse_args()
-    for name in options.planners:
+    options, flags = parser.parse_known_args()
+    name = options.config.stem + (f"_{options.name}" if options.name else "")
+    for planner in options.planners:
         run_facts = describe_run()
-        result = measure(name, options.n_blocks, options.episodes, options.seed)
-        path = RESULTS / f"block_sorting_2d_{options.n_blocks}_blocks_{name}.json"
+        result = measure(options.config, name, planner, options.episodes, options.seed, flags)
+        path = RESULTS / f"{name}_{planner}.json"
         path.write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
         print(path.read_text())
 
