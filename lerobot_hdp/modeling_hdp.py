@@ -16,7 +16,7 @@ from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
 from .encoders import StateEncoder
 from .plan import Plan, PlanPrompt
-from .processes import GaussianProcess, GaussianSymbolProcess, MaskedProcess, SymbolProcess
+from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess, Process, SymbolProcess
 from .sampling import DenoisingState, sample_plan
 from .vocabulary import Vocabulary
 
@@ -111,7 +111,8 @@ class HDPPolicy(PreTrainedPolicy):
             return self._loss(batch, self._planning_network)
         self.forward_calls += 1
         with torch.random.fork_rng(devices=self._cuda_devices):
-            torch.manual_seed(_step_seed(int(self.noise_seed), int(self.forward_calls)))
+            step = np.random.SeedSequence([int(self.noise_seed), int(self.forward_calls)])
+            torch.manual_seed(int(step.generate_state(1)[0]))
             return self._loss(batch, self.planner)
 
     def _make_planner(self) -> Planner:
@@ -119,22 +120,40 @@ class HDPPolicy(PreTrainedPolicy):
 
     def _loss(self, batch: dict[str, Tensor], network: Planner) -> tuple[Tensor, dict[str, float]]:
         motion = batch[ACTION]
-        batch_size, device = len(motion), motion.device
-        k_c = self.motion_process.sample_level(batch_size, device)
-        noisy_motion = self.motion_process.corrupt(motion, k_c)
-        observation = network.encoder(batch)
+        levels = self._sample_levels(self.motion_process, len(motion))
+        noisy_motion = self._corrupt(self.motion_process, motion, levels)
+        observation, k_c = network.encoder(batch), noisy_motion.level
         if self.symbol_process is None:
             prediction = network.denoiser(noisy_motion.value, None, observation, k_c, torch.zeros_like(k_c))
             loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
             return loss, {"motion_loss": loss.item()}
 
-        k_d = k_c if self.config.shared_level else self.symbol_process.sample_level(batch_size, device)
-        corrupted_symbols = self.symbol_process.corrupt(batch[OBS_SYMBOLIC_PLAN], k_d)
-        prediction = network.denoiser(noisy_motion.value, corrupted_symbols.value, observation, k_c, k_d)
+        if not self.config.shared_level:
+            levels = self._sample_levels(self.symbol_process, len(motion))
+        corrupted_symbols = self._corrupt(self.symbol_process, batch[OBS_SYMBOLIC_PLAN], levels)
+        prediction = network.denoiser(
+            noisy_motion.value, corrupted_symbols.value, observation, k_c, corrupted_symbols.level
+        )
         motion_loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
         symbol_loss = self.symbol_process.loss(prediction.symbols, corrupted_symbols).mean()
         loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
         return loss, {"motion_loss": motion_loss.item(), "symbol_loss": symbol_loss.item()}
+
+    def _sample_levels(self, process: Process, batch_size: int) -> Tensor:
+        """Levels for the batches of all processes of a distributed run, (processes x B,); see `_corrupt`."""
+        return process.sample_level(_rank_and_world_size()[1] * batch_size, self.noise_seed.device)
+
+    def _corrupt(self, process: Process, clean: Tensor, levels: Tensor) -> Corrupted:
+        """Corrupt this process' batch, as one process would corrupt it as a part of the batches of all of them.
+
+        So a run on n devices is the run on one device with n times the batch size.
+        """
+        rank, world_size = _rank_and_world_size()
+        if world_size == 1:
+            return process.corrupt(clean, levels)
+        corrupted = process.corrupt(clean.repeat(world_size, *[1] * (clean.ndim - 1)), levels)
+        own = slice(rank * len(clean), (rank + 1) * len(clean))
+        return Corrupted(corrupted.value[own], corrupted.target[own], corrupted.level[own])
 
     @torch.no_grad()
     def plan(
@@ -270,10 +289,11 @@ def _moving_average(network: nn.Module, config: HDPConfig) -> AveragedModel:
     return average.requires_grad_(False).eval()
 
 
-def _step_seed(noise_seed: int, call: int) -> int:
-    """A seed for one training step, different on each process of a distributed run."""
-    rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
-    return int(np.random.SeedSequence([noise_seed, call, rank]).generate_state(1)[0])
+def _rank_and_world_size() -> tuple[int, int]:
+    """Number of this process, and how many there are in a distributed run."""
+    if not torch.distributed.is_initialized():
+        return 0, 1
+    return torch.distributed.get_rank(), torch.distributed.get_world_size()
 
 
 def _check_episodes_fit(config: HDPConfig, lengths: Iterable[int]) -> None:

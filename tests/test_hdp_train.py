@@ -1,6 +1,8 @@
 """`hdp-train`: the same samples as LeRobot reads, the same training as `lerobot-train` does, from memory."""
 
 import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ FPS = 10
 STEPS = 6
 PLANNER_FLAGS = ("--policy.type=hdp", *(f"--policy.{name}={value}" for name, value in TINY_PLANNER.items()))
 DIFFUSION_FLAGS = ("--policy.type=diffusion", "--policy.down_dims=[16,32]", "--policy.crop_shape=[24,24]")
+DIFFUSION_FLAGS += ("--policy.pretrained_backbone_weights=null", "--policy.use_group_norm=true")
 ACT_FLAGS = ("--policy.type=act", "--policy.dim_model=32", "--policy.dim_feedforward=32", "--policy.n_heads=2")
 ACT_FLAGS += ("--policy.chunk_size=5", "--policy.n_action_steps=5", "--policy.pretrained_backbone_weights=null")
 
@@ -116,7 +119,7 @@ def test_memory_needed_counts_every_tensor(camera_root):
 
 def train(command, root, output_dir, policy_flags, *flags):
     return run_command(
-        command,
+        *([command] if isinstance(command, str) else command),
         "--dataset.repo_id=test/dataset",
         f"--dataset.root={root}",
         "--dataset.video_backend=pyav",
@@ -124,7 +127,7 @@ def train(command, root, output_dir, policy_flags, *flags):
         *policy_flags,
         "--policy.push_to_hub=false",
         "--policy.device=cpu",
-        "--batch_size=8",
+        "--batch_size=10",
         f"--steps={STEPS}",
         f"--save_freq={STEPS}",
         "--num_workers=0",
@@ -174,6 +177,17 @@ def test_a_dataset_beyond_the_budget_is_read_as_by_lerobot_train(dataset_root, l
     result = train("hdp-train", dataset_root, tmp_path / "run", PLANNER_FLAGS, "--max_memory_gib=0.0001")
     assert "more than --max_memory_gib=0.0001" in result.stderr
     assert_same_weights(weights(tmp_path / "run"), weights(lerobot_train_run[1]))
+
+
+def test_two_processes_do_what_one_does_with_twice_the_batch(dataset_root, lerobot_train_run, tmp_path):
+    expected, expected_dir = lerobot_train_run
+    command = ("torchrun", "--nproc_per_node=2", Path(sys.executable).with_name("hdp-train"))
+    result = train(command, dataset_root, tmp_path / "run", PLANNER_FLAGS, "--batch_size=5")
+    assert "Effective batch size: 5 x 2 = 10" in result.stderr
+    assert losses(result) == losses(expected)
+    one, two = weights(expected_dir), weights(tmp_path / "run")
+    for name, value in one.items():
+        torch.testing.assert_close(two[name], value, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("camera_root", ["video"], indirect=True)

@@ -125,15 +125,15 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
 
     def _loss(self, batch: dict[str, Tensor], network: HierarchicalPlanner) -> tuple[Tensor, dict[str, float]]:
         """Each level's squared error; the low level is trained on the demonstration's own sub-goals."""
-        process, device = self.motion_process, self.noise_seed.device
+        process = self.motion_process
         states, segments = self._states(batch), self._to_segments(batch[ACTION])
         state, subgoals = states[:, 0], states[:, 1:]
 
-        noisy_subgoals = process.corrupt(subgoals, process.sample_level(len(subgoals), device))
+        noisy_subgoals = self._corrupt(process, subgoals, self._sample_levels(process, len(subgoals)))
         prediction = network.denoise_subgoals(noisy_subgoals.value, state, noisy_subgoals.level, None)
         subgoal_loss = process.loss(prediction, noisy_subgoals).mean()
 
-        noisy_segments = process.corrupt(segments, process.sample_level(len(segments), device))
+        noisy_segments = self._corrupt(process, segments, self._sample_levels(process, len(segments)))
         prediction = network.denoise_segments(noisy_segments.value, state, subgoals, noisy_segments.level)
         motion_loss = process.loss(prediction, noisy_segments).mean()
         return subgoal_loss + motion_loss, {"subgoal_loss": subgoal_loss.item(), "motion_loss": motion_loss.item()}
@@ -186,13 +186,13 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
 
     def _loss(self, batch: dict[str, Tensor], network: HierarchicalPlanner) -> tuple[Tensor, dict[str, float]]:
         """Each level's squared error, at the same step k, each conditioned on the other as in planning."""
-        process, device = self.motion_process, self.noise_seed.device
+        process = self.motion_process
         states, segments = self._states(batch), self._to_segments(batch[ACTION])
         state, subgoals = states[:, 0], states[:, 1:]
-        level = process.sample_level(len(state), device)
-        noisy_subgoals = process.corrupt(subgoals, level)
-        noisy_segments = process.corrupt(segments, level.repeat_interleave(self.config.num_segments))
-        high, low = self._denoise_both(network, noisy_subgoals.value, noisy_segments.value, state, level)
+        levels = self._sample_levels(process, len(state))
+        noisy_subgoals = self._corrupt(process, subgoals, levels)
+        noisy_segments = self._corrupt(process, segments, levels.repeat_interleave(self.config.num_segments))
+        high, low = self._denoise_both(network, noisy_subgoals.value, noisy_segments.value, state, noisy_subgoals.level)
         subgoal_loss = process.loss(high, noisy_subgoals).mean()
         motion_loss = process.loss(low, noisy_segments).mean()
         return subgoal_loss + motion_loss, {"subgoal_loss": subgoal_loss.item(), "motion_loss": motion_loss.item()}
