@@ -31,7 +31,7 @@ class JointDiffuserConfig(HDPConfig):
     symbol_process = "gaussian"
     shared_level = True
 
-    symbol_loss_weight: float | None = 1.0
+    symbol_loss_weight: float | None = 0.1
 
 
 @PreTrainedConfig.register_subclass("separate_diffuser")
@@ -45,4 +45,4 @@ class SeparateDiffuserConfig(HDPConfig):
 
     symbol_process = "gaussian"
 
-    symbol_loss_weight: float | None = 1.0
+    symbol_loss_weight: float | None = 0.1
