@@ -1,7 +1,8 @@
 """The planner as a LeRobot policy."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,15 @@ from safetensors import SafetensorError
 from torch import Generator, Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
+from .candidates import best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
 from .encoders import StateEncoder
-from .plan import Plan, PlanPrompt
+from .plan import Plan, PlanCheck, PlanPrompt
 from .processes import GaussianProcess, MaskedProcess
-from .sampling import DenoisingState, sample_plan
-from .vocabulary import Vocabulary
+from .prompt import choose_placement, encode_prompt, shared_tokens
+from .sampling import Denoise, DenoisingState, sample_plan
+from .vocabulary import FREE, Vocabulary
 
 
 class Planner(nn.Module):
@@ -131,18 +134,71 @@ class HDPPolicy(PreTrainedPolicy):
     def plan(
         self,
         batch: dict[str, Tensor],
-        prompt: PlanPrompt | None = None,
+        prompt: str | Sequence[str] | PlanPrompt | None = None,
         generator: Generator | None = None,
         on_step: Callable[[int, DenoisingState], None] | None = None,
+        num_candidates: int | None = None,
+        check: PlanCheck | None = None,
     ) -> Plan:
         """Algorithm 2: make a plan for each observation of a batch, from scratch or around a prompt.
 
         Args:
-            batch: preprocessed observations. `observation.symbolic_plan` among them, as an environment may give it,
-                is a prompt.
-            prompt: the part of the plan that is given.
+            batch: preprocessed observations.
+            prompt: the part of the plan that is given, see `read_prompt`.
             generator: source of all randomness; None: PyTorch's global one.
-            on_step: sees the half-done plan after each step.
+            on_step: sees the half-done plan after each step, and all candidates of it: those of one observation follow
+                each other.
+            num_candidates: k plans are drawn for each observation, and the one that the model itself finds most
+                likely is kept (`candidates.score_plans`). None: as the configuration says.
+            check: the task's checker. The candidates with the fewest complaints are preferred to all others.
+
+        Raises:
+            ValueError: an observation with NaN or infinity, or a prompt that does not fit.
+        """
+        k = self.config.num_candidates if num_candidates is None else num_candidates
+        if k < 1:
+            raise ValueError(f"num_candidates must be at least 1, got {k}")
+        prompt = self.read_prompt(batch, prompt, generator)
+        if k == 1:
+            return self._sample(batch, prompt, generator, on_step)
+
+        repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in self.config.input_features}
+        plans = self._sample(repeated, prompt.repeat(k), generator, on_step)
+        scores = torch.stack([self.score(batch, plans.select(slice(i, None, k))) for i in range(k)], dim=1)
+        complaints = None
+        if check is not None:
+            about = plans.validate(lambda index, symbols: check(index // k, symbols))
+            complaints = [[len(found) for found in about[start : start + k]] for start in range(0, len(about), k)]
+        best = best_candidates(scores, complaints)
+        samples = torch.arange(len(best), device=best.device)
+        kept = plans.select(samples * k + best)
+        return replace(kept, scores=scores[samples, best], candidate=best)
+
+    @torch.no_grad()
+    def score(self, batch: dict[str, Tensor], plan: Plan) -> Tensor:
+        """How likely a plan for each observation is under the model, up to scale: (B,), see `score_plans`."""
+        processes = self.motion_process, self.symbol_process
+        return score_plans(
+            self._denoiser(batch), *processes, plan.actions, plan.token_ids, self.config.symbol_loss_weight
+        )
+
+    @torch.no_grad()
+    def read_prompt(
+        self,
+        batch: dict[str, Tensor],
+        prompt: str | Sequence[str] | PlanPrompt | None = None,
+        generator: Generator | None = None,
+    ) -> PlanPrompt:
+        """What is given of each plan of a batch.
+
+        It comes from the argument, else from the configuration (`--policy.prompt`), else from the environment, in
+        `observation.symbolic_plan`. Where words do not say their place in the plan ("... STACK red"), the planner
+        draws one, by one call of the network.
+
+        Args:
+            batch: preprocessed observations.
+            prompt: words (see prompt.py), the same for all samples or for each its own; or token ids and actions.
+            generator: source of randomness; None: PyTorch's global one.
 
         Raises:
             ValueError: an observation with NaN or infinity, or a prompt that does not fit.
@@ -150,33 +206,70 @@ class HDPPolicy(PreTrainedPolicy):
         for key in self.config.input_features:
             if not torch.isfinite(batch[key]).all():
                 raise ValueError(f"{key} holds NaN or infinity: no plan can be made from it")
+        if prompt is None and self.config.prompt:
+            prompt = self.config.prompt
         if prompt is None and OBS_SYMBOLIC_PLAN in batch and self.symbol_process is not None:
             prompt = PlanPrompt(token_ids=batch[OBS_SYMBOLIC_PLAN])
-        batch_size, device = len(batch[self.planner.encoder.keys[0]]), self.noise_seed.device
-        motion_shape = (batch_size, self.config.horizon, self.config.action_feature.shape[0])
-        self._check_prompt(prompt, motion_shape)
+        if prompt is None:
+            return PlanPrompt()
+        if not isinstance(prompt, PlanPrompt):
+            texts = [prompt] * self._batch_size(batch) if isinstance(prompt, str) else list(prompt)
+            prompt = PlanPrompt(token_ids=self._place_words(batch, texts, generator))
+        self._check_prompt(prompt, self._batch_size(batch))
+        return prompt
 
-        network = self._planning_network
-        observation = network.encoder(batch)
+    def _place_words(self, batch: dict[str, Tensor], texts: list[str], generator: Generator | None) -> Tensor:
+        """Token ids of a prompt in words for each sample: (B, H_d)."""
+        if self.symbol_process is None:
+            raise ValueError("this planner models no symbols (plan_symbols=false): it takes no symbolic prompt")
+        if len(texts) != self._batch_size(batch):
+            raise ValueError(f"there are {len(texts)} prompts for {self._batch_size(batch)} observations")
+        length = self.config.symbolic_horizon
+        encoded = {text: encode_prompt(text, self.vocabulary, length).to(self._device) for text in set(texts)}
+        placements = [encoded[text] for text in texts]
+        if all(len(ways) == 1 for ways in placements):
+            return torch.cat(placements)
+        # The most corrupted plan, with what is given in any case: its symbols' probabilities are those of the places.
+        given = torch.stack([shared_tokens(ways) for ways in placements])
+        tokens = given.masked_fill(given == FREE, self.symbol_process.mask_id)
+        motion = self.motion_process.prior(self._motion_shape(batch), self._device, generator)
+        k_c = torch.ones(len(texts), device=self._device)
+        logits = self._denoiser(batch)(motion, tokens, k_c, (given == FREE).float().mean(dim=1)).logits
+        drawn = zip(placements, logits, strict=True)
+        return torch.stack([choose_placement(ways, scores, generator) for ways, scores in drawn])
 
-        def denoise(motion: Tensor, tokens: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
-            with torch.autocast(device.type, torch.bfloat16, enabled=self.config.dtype == "bfloat16"):
-                prediction = network.denoiser(motion, tokens, observation, k_c, k_d)
-            return Prediction(prediction.motion.float(), prediction.logits)
-
+    def _sample(
+        self,
+        batch: dict[str, Tensor],
+        prompt: PlanPrompt,
+        generator: Generator | None,
+        on_step: Callable[[int, DenoisingState], None] | None,
+    ) -> Plan:
         motion, tokens, probabilities = sample_plan(
-            denoise,
+            self._denoiser(batch),
             self.motion_process,
             self.symbol_process,
-            motion_shape,
+            self._motion_shape(batch),
             self.config.symbolic_horizon or 0,
-            device,
+            self._device,
             self.config.num_inference_steps or self.config.num_train_timesteps,
             prompt,
             generator,
             on_step,
         )
         return Plan(motion, tokens, probabilities, self.vocabulary)
+
+    def _denoiser(self, batch: dict[str, Tensor]) -> Denoise:
+        """The denoiser for the observations of a batch."""
+        network = self._planning_network
+        observation = network.encoder(batch)
+
+        def denoise(motion: Tensor, tokens: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
+            with torch.autocast(self._device.type, torch.bfloat16, enabled=self.config.dtype == "bfloat16"):
+                prediction = network.denoiser(motion, tokens, observation, k_c, k_d)
+            return Prediction(prediction.motion.float(), prediction.logits)
+
+        return denoise
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
@@ -196,21 +289,29 @@ class HDPPolicy(PreTrainedPolicy):
         return self.planner if self.ema is None else self.ema.module
 
     @property
-    def _cuda_devices(self) -> list[torch.device]:
-        device = self.noise_seed.device
-        return [device] if device.type == "cuda" else []
+    def _device(self) -> torch.device:
+        return self.noise_seed.device
 
-    def _check_prompt(self, prompt: PlanPrompt | None, motion_shape: tuple[int, int, int]) -> None:
-        if prompt is None:
-            return
+    @property
+    def _cuda_devices(self) -> list[torch.device]:
+        return [self._device] if self._device.type == "cuda" else []
+
+    def _batch_size(self, batch: dict[str, Tensor]) -> int:
+        return len(batch[self.planner.encoder.keys[0]])
+
+    def _motion_shape(self, batch: dict[str, Tensor]) -> tuple[int, int, int]:
+        return self._batch_size(batch), self.config.horizon, self.config.action_feature.shape[0]
+
+    def _check_prompt(self, prompt: PlanPrompt, batch_size: int) -> None:
         if prompt.token_ids is not None:
             if self.symbol_process is None:
                 raise ValueError("this planner models no symbols (plan_symbols=false): it takes no symbolic prompt")
-            expected = (motion_shape[0], self.config.symbolic_horizon)
+            expected = (batch_size, self.config.symbolic_horizon)
             if tuple(prompt.token_ids.shape) != expected:
                 raise ValueError(f"token_ids must have the shape {expected}, got {tuple(prompt.token_ids.shape)}")
-        if prompt.actions is not None and tuple(prompt.actions.shape) != motion_shape:
-            raise ValueError(f"actions must have the shape {motion_shape}, got {tuple(prompt.actions.shape)}")
+        expected = (batch_size, self.config.horizon, self.config.action_feature.shape[0])
+        if prompt.actions is not None and tuple(prompt.actions.shape) != expected:
+            raise ValueError(f"actions must have the shape {expected}, got {tuple(prompt.actions.shape)}")
 
     @classmethod
     def _load_as_safetensor(cls, model: "HDPPolicy", model_file: str, map_location: str, strict: bool) -> "HDPPolicy":

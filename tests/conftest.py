@@ -74,3 +74,11 @@ def batch(dataset):
     """The first frames of four episodes, collated as LeRobot's data loader does."""
     items = [dataset[episode * HORIZON] for episode in range(4)]
     return torch.utils.data.default_collate(items)
+
+
+@pytest.fixture
+def inputs(make_planner, batch):
+    """The preprocessed observations of the same."""
+    _, preprocessor, _ = make_planner()
+    names = ("observation.state", "observation.environment_state")
+    return {name: value for name, value in preprocessor(batch).items() if name in names}

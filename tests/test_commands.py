@@ -150,8 +150,12 @@ def test_hdp_plan_prints_and_draws_a_plan(checkpoint, tmp_path):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--prompt=PICK D"], "unknown symbol 'D' at position 2; the symbols are PAD A B PICK PLACE S1 S2 AUX"),
-        (["--prompt=" + "PICK " * 19], "19 symbols do not fit into a plan of 18"),
+        (
+            ["--prompt=PICK D"],
+            "unknown symbol 'D' (word 2 of the prompt); the symbols are PAD A B PICK PLACE S1 S2 AUX",
+        ),
+        (["--policy.prompt=PICK D"], "unknown symbol 'D' (word 2 of the prompt)"),
+        (["--prompt=" + "PICK " * 19], "does not fit into a plan of 18 symbols"),
         (["--policy.path=nowhere/to/be/found"], "nowhere/to/be/found"),
     ],
 )

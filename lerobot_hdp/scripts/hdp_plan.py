@@ -23,12 +23,10 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from torch import Tensor
 
-from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
 from lerobot_hdp.drawing import MASK_WORD, PlanPicture, draw_plan, save_animation
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.plan import Plan, PlanPrompt
 from lerobot_hdp.sampling import DenoisingState
-from lerobot_hdp.vocabulary import FREE
 
 WORDS_PER_ROW = 6
 ANIMATION_FRAMES = 40
@@ -42,7 +40,7 @@ class PlanConfig:
         policy: the planner, by `--policy.path=` (a checkpoint's `pretrained_model` folder or a Hub repository).
         env: the task. None: the one in the checkpoint's training configuration.
         seed: seed of the start and of the plan.
-        prompt: the beginning of the plan, in words, with `_` for a symbol that the planner chooses.
+        prompt: a part of the plan in words, e.g. "PICK B ..." or "... STACK red" (docs/conditioning.md).
         output_dir: where the pictures go.
     """
 
@@ -108,7 +106,7 @@ def make_plan(config: PlanConfig) -> Result:
         env = next(iter(vector_envs[config.env.type].values()))
         observation, _ = env.reset(seed=config.seed)
         batch = preprocessor(env_preprocessor(preprocess_observation(observation)))
-        prompt = _prompt(config, policy, batch)
+        prompt = policy.read_prompt(batch, config.prompt or None)
 
         states: list[DenoisingState] = []
         plan = policy.plan(batch, prompt, on_step=lambda _, state: states.append(state))
@@ -124,24 +122,12 @@ def make_plan(config: PlanConfig) -> Result:
         close_envs(vector_envs)
 
 
-def _prompt(config: PlanConfig, policy: HDPPolicy, batch: dict[str, Tensor]) -> PlanPrompt | None:
-    """The prompt from the command line, else the environment's own."""
-    if config.prompt:
-        if policy.vocabulary is None:
-            raise ValueError("this planner models no symbols: it takes no --prompt")
-        ids = policy.vocabulary.encode_prompt(config.prompt, policy.config.symbolic_horizon)
-        return PlanPrompt(token_ids=ids[None].to(policy.config.device))
-    if OBS_SYMBOLIC_PLAN in batch:
-        return PlanPrompt(token_ids=batch[OBS_SYMBOLIC_PLAN])
-    return None
-
-
 def _draw(
     config: PlanConfig,
     env: gym.vector.VectorEnv,
     policy: HDPPolicy,
     plan: Plan,
-    prompt: PlanPrompt | None,
+    prompt: PlanPrompt,
     states: list[DenoisingState],
     unnormalise: Callable[[Tensor], np.ndarray],
 ) -> tuple[Path, Path]:
@@ -149,7 +135,7 @@ def _draw(
     scene = env.call("render")[0]
     length = max(len(plan.symbols()), 1)
     rows = -(-length // WORDS_PER_ROW) if policy.vocabulary else 0
-    given = (prompt.token_ids[0] != FREE).tolist() if prompt is not None else None
+    given = prompt.tokens_mask[0].tolist() if prompt.tokens_mask is not None else None
 
     def words(tokens: Tensor | None) -> list[str]:
         if tokens is None:
