@@ -1,8 +1,9 @@
 """What a caller of the planner gives and gets."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -88,8 +89,9 @@ class Plan:
 
     def select(self, samples: Tensor | slice) -> "Plan":
         """The plans of some of the samples."""
-        chosen = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Plan(**{name: value[samples] if isinstance(value, Tensor) else value for name, value in chosen.items()})
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        tensors: dict[str, Any] = {name: value[samples] for name, value in values.items() if isinstance(value, Tensor)}
+        return replace(self, **tensors)
 
     def validate(self, check: PlanCheck) -> list[list[str]]:
         """What is wrong with the symbolic plan of each sample, in words: B lists, empty for a valid plan.
