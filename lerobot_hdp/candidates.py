@@ -10,6 +10,12 @@ from .sampling import Denoise
 
 MOTION_LEVELS = (0.25, 0.5, 0.75)
 """Levels at which the motion is denoised again to score it."""
+SYMBOL_WEIGHT = 1 / 30
+"""Of the symbols' loss beside the motion's: the paper's lambda. Measured from 1/1000 to 1: next to no difference."""
+PARTIAL_MOTION_CANDIDATES = 8
+"""How many plans are drawn around a part of a motion, unless the caller says. The given part is shown with the noise of
+each step, so that a plan may have taken its course before that part can be seen (Trippe et al. 2023, "Diffusion
+probabilistic modeling of protein backbones in 3D for the motif-scaffolding problem"); such a plan scores low."""
 NOISE_SEED = 0
 """Every call of `score_plans` draws the same noise: candidates differ by what they are, not by their luck."""
 
@@ -21,7 +27,6 @@ def score_plans(
     symbol_process: MaskedProcess | None,
     motion: Tensor,
     tokens: Tensor | None,
-    symbol_weight: float,
 ) -> Tensor:
     """How likely plans are under the model, up to scale: (B,), more is better. It knows nothing of the task.
 
@@ -34,7 +39,6 @@ def score_plans(
         motion_process, symbol_process: the processes; without the latter the motion alone is scored.
         motion: (B, H_c, D) normalised actions.
         tokens: (B, H_d) token ids.
-        symbol_weight: lambda, as in training.
     """
     generator = Generator(motion.device).manual_seed(NOISE_SEED)
     one = torch.ones(len(motion), device=motion.device)
@@ -49,7 +53,7 @@ def score_plans(
     if symbol_process and symbols:
         prediction = denoise(motion, hidden, 0 * one, one)
         assert prediction.logits is not None
-        loss += symbol_weight * symbol_process.loss(prediction.logits, symbols)
+        loss += SYMBOL_WEIGHT * symbol_process.loss(prediction.logits, symbols)
     return -loss
 
 

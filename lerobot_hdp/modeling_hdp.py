@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from torch import Generator, Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from .candidates import best_candidates, score_plans
+from .candidates import PARTIAL_MOTION_CANDIDATES, best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
 from .encoders import StateEncoder
@@ -149,16 +149,19 @@ class HDPPolicy(PreTrainedPolicy):
             on_step: sees the half-done plan after each step, and all candidates of it: those of one observation follow
                 each other.
             num_candidates: k plans are drawn for each observation, and the one that the model itself finds most
-                likely is kept (`candidates.score_plans`). None: as the configuration says.
+                likely is kept (`candidates.score_plans`). None: as the configuration says, and at least
+                `PARTIAL_MOTION_CANDIDATES` where a part of the motion is given.
             check: the task's checker. The candidates with the fewest complaints are preferred to all others.
 
         Raises:
             ValueError: an observation with NaN or infinity, or a prompt that does not fit.
         """
-        k = self.config.num_candidates if num_candidates is None else num_candidates
+        prompt = self.read_prompt(batch, prompt, generator)
+        k = num_candidates
+        if k is None:
+            k = max(self.config.num_candidates, PARTIAL_MOTION_CANDIDATES if prompt.gives_part_of_motion else 1)
         if k < 1:
             raise ValueError(f"num_candidates must be at least 1, got {k}")
-        prompt = self.read_prompt(batch, prompt, generator)
         if k == 1:
             return self._sample(batch, prompt, generator, on_step)
 
@@ -178,9 +181,7 @@ class HDPPolicy(PreTrainedPolicy):
     def score(self, batch: dict[str, Tensor], plan: Plan) -> Tensor:
         """How likely a plan for each observation is under the model, up to scale: (B,), see `score_plans`."""
         processes = self.motion_process, self.symbol_process
-        return score_plans(
-            self._denoiser(batch), *processes, plan.actions, plan.token_ids, self.config.symbol_loss_weight
-        )
+        return score_plans(self._denoiser(batch), *processes, plan.actions, plan.token_ids)
 
     @torch.no_grad()
     def read_prompt(

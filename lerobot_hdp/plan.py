@@ -50,6 +50,11 @@ class PlanPrompt:
             return torch.ones_like(self.actions[..., :1], dtype=torch.bool)
         return self.actions_given[..., None]
 
+    @property
+    def gives_part_of_motion(self) -> bool:
+        """Whether some actions are given, but not all."""
+        return self.actions_given is not None and bool(self.actions_given.any()) and not self.actions_given.all()
+
     def repeat(self, times: int) -> "PlanPrompt":
         """Each sample's prompt `times` times, one after the other: (B times, ...)."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
