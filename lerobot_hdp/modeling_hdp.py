@@ -230,6 +230,8 @@ class HDPPolicy(PreTrainedPolicy):
         placements = [encoded[text] for text in texts]
         if all(len(ways) == 1 for ways in placements):
             return torch.cat(placements)
+        if not isinstance(self.symbol_process, MaskedProcess):
+            raise ValueError("this planner cannot place words after '...': number their positions, as in 11:STACK")
         # The most corrupted plan, with what is given in any case: its symbols' probabilities are those of the places.
         given = torch.stack([shared_tokens(ways) for ways in placements])
         tokens = given.masked_fill(given == FREE, self.symbol_process.mask_id)
