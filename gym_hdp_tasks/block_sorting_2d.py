@@ -4,13 +4,15 @@ The smallest task on which a long motion needs a plan: two blocks can only be ex
 slot. Kinematic and exact, so that a failure is the planner's and never the physics'.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import gymnasium as gym
 import numpy as np
 
-from .task import PAD, PlanningTask
+from .plan_rules import Observation, check_sorting_plan, slots_of_blocks
+from .task import PAD, PlanningTask, equal_steps
 
 # All lengths in metres.
 SLOT_SPACING = 0.15
@@ -79,7 +81,18 @@ def block_sorting_2d_task(n_blocks: int = 3, waypoints_per_pose: int = 3) -> Pla
         action_names=("x", "y", "gripper"),
         fps=FPS,
         robot_type="gripper_2d",
+        step_ends=equal_steps(most_moves, tokens=6, waypoints=KEY_POSES_PER_MOVE * waypoints_per_pose),
+        check_plan=check_plan,
     )
+
+
+def check_plan(symbols: Sequence[str], observation: Observation) -> list[str]:
+    """What is wrong with a plan, see `check_sorting_plan`."""
+    positions = observation["environment_state"].reshape(-1, 2)
+    n_blocks = len(positions)
+    slots = [slot_name(slot, n_blocks) for slot in range(n_blocks + 1)]
+    start = slots_of_blocks(positions, slot_centres(n_blocks), slots)
+    return check_sorting_plan(symbols, {block_name(i): slot for i, slot in enumerate(start)}, slots)
 
 
 class BlockSorting2DEnv(gym.Env):

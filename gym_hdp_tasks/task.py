@@ -1,7 +1,10 @@
 """What every task states about itself: its words, its sizes and its units."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+from .plan_rules import Observation
 
 PAD = "PAD"
 """Symbol with id 0: fills a plan that is shorter than the symbolic horizon."""
@@ -23,6 +26,9 @@ class PlanningTask:
         action_names: components of `action`.
         fps: actions per second.
         robot_type: what LeRobot writes into the dataset's `robot_type`.
+        step_ends: (tokens, waypoints) of a demonstration up to the end of each step: the first step is the tokens 0 to
+            step_ends[0][0] - 1 and the waypoints 0 to step_ends[0][1] - 1. Every demonstration keeps this time.
+        check_plan: (symbols without PAD, observation) -> what is wrong with the plan, in words.
     """
 
     gym_id: str
@@ -35,6 +41,8 @@ class PlanningTask:
     action_names: tuple[str, ...]
     fps: int
     robot_type: str
+    step_ends: tuple[tuple[int, int], ...]
+    check_plan: Callable[[Sequence[str], Observation], list[str]] = field(compare=False)
     parameters: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -42,3 +50,8 @@ class PlanningTask:
             raise ValueError(f"the first symbol of a vocabulary is {PAD}, got {self.vocabulary[0]!r}")
         if len(set(self.vocabulary)) != len(self.vocabulary):
             raise ValueError(f"a vocabulary names each symbol once, got {self.vocabulary}")
+
+
+def equal_steps(steps: int, tokens: int, waypoints: int) -> tuple[tuple[int, int], ...]:
+    """`step_ends` where each step has as many tokens and waypoints, after a first waypoint where the tool is."""
+    return tuple((step * tokens, step * waypoints + 1) for step in range(1, steps + 1))

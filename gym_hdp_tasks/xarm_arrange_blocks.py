@@ -1,13 +1,15 @@
 """`hdp/XArmArrangeBlocks-v0`: put a block into each of three slots, whichever block (paper, "Arrange Blocks")."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from .plan_rules import Observation, read_moves
 from .scene import BLOCK_HALF_SIZE, BLUE, GREEN, GREY, RED, add_block, add_slot
-from .task import PAD, PlanningTask
-from .xarm_env import STATE_NAMES, XArmEnv, pose_names
+from .task import PAD, PlanningTask, equal_steps
+from .xarm_env import POSE_NAMES, STATE_NAMES, XArmEnv, pose_names
 
 # All lengths in metres.
 BLOCKS = ("A", "B", "C")
@@ -41,7 +43,27 @@ def xarm_arrange_blocks_task(robot: str = "primitive") -> PlanningTask:
         action_names=STATE_NAMES,
         fps=FPS,
         robot_type="xarm7",
+        step_ends=equal_steps(MOVES, TOKENS_PER_MOVE, KEY_POSES_PER_MOVE),
+        check_plan=check_plan,
     )
+
+
+def check_plan(symbols: Sequence[str], observation: Observation) -> list[str]:
+    """What is wrong with a plan: PICK block PLACE block slot, each slot gets a block, and none is in the way."""
+    where = observation["environment_state"].reshape(len(BLOCKS), len(POSE_NAMES))[:, :2].copy()
+    moves, complaints = read_moves(symbols, (["PICK"], BLOCKS, ["PLACE"], BLOCKS, SLOTS))
+    for number, (_, block, _, placed, slot) in enumerate(moves, start=1):
+        if placed != block:
+            complaints.append(f"move {number} picks {block}, but places {placed}")
+        centre = SLOT_CENTRES[SLOTS.index(slot)]
+        complaints += [
+            f"move {number} places {placed} in {slot}, where {other} is in the way"
+            for other, position in zip(BLOCKS, where, strict=True)
+            if other != placed and not clear(centre, position[None])
+        ]
+        where[BLOCKS.index(placed)] = centre
+    filled = (np.abs(SLOT_CENTRES[:, None] - where[None]).max(axis=2) <= SLOT_HALF_SIZE).any(axis=1)
+    return complaints + [f"no block ends in {slot}" for slot, full in zip(SLOTS, filled, strict=True) if not full]
 
 
 class XArmArrangeBlocksEnv(XArmEnv):

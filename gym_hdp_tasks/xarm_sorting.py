@@ -1,13 +1,15 @@
 """`hdp/XArmSorting-v0`: sort three blocks into their slots with one auxiliary slot (paper, "X-Arm Sorting")."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from .plan_rules import Observation, check_sorting_plan, slots_of_blocks
 from .scene import BLOCK_HALF_SIZE, BLUE, GREEN, GREY, RED, add_block, add_slot
-from .task import PAD, PlanningTask
-from .xarm_env import STATE_NAMES, XArmEnv, pose_names
+from .task import PAD, PlanningTask, equal_steps
+from .xarm_env import POSE_NAMES, STATE_NAMES, XArmEnv, pose_names
 
 # All lengths in metres.
 BLOCKS = ("A", "B", "C")
@@ -44,7 +46,16 @@ def xarm_sorting_task(robot: str = "primitive") -> PlanningTask:
         action_names=STATE_NAMES,
         fps=FPS,
         robot_type="xarm7",
+        step_ends=equal_steps(MOST_MOVES, TOKENS_PER_MOVE, KEY_POSES_PER_MOVE * WAYPOINTS_PER_POSE),
+        check_plan=check_plan,
     )
+
+
+def check_plan(symbols: Sequence[str], observation: Observation) -> list[str]:
+    """What is wrong with a plan, see `check_sorting_plan`."""
+    positions = observation["environment_state"].reshape(len(BLOCKS), len(POSE_NAMES))[:, :2]
+    start = slots_of_blocks(positions, SLOT_CENTRES, SLOTS)
+    return check_sorting_plan(symbols, dict(zip(BLOCKS, start, strict=True)), SLOTS)
 
 
 class XArmSortingEnv(XArmEnv):

@@ -1,12 +1,15 @@
 """`hdp/XArmToolUse-v0` and `hdp/XArmToolUseRedOnTop-v0`: drag three blocks within reach with a hook, then stack
 them (paper, "Tool-use experiment" and "conditional plan coherence")."""
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 
+from .plan_rules import Observation, read_moves
 from .scene import BLOCK_HALF_SIZE, BLUE, GREEN, GREY, RED, add_block, add_slot
 from .task import PAD, PlanningTask
 from .xarm_env import REST_TOLERANCE, STATE_NAMES, XArmEnv, pose_names
@@ -41,6 +44,8 @@ TOKENS_PER_MOVE = 2
 HORIZON = 61
 SYMBOLIC_HORIZON = 15
 """Six moves take 12 tokens; the paper's table has 15."""
+STEP_ENDS = ((2, 14), (4, 23), (6, 36), (8, 44), (10, 52), (12, 60))
+"""Of a demonstration: the hook is grasped in the first move and laid down in the third, hence the longer ones."""
 FPS = 1
 
 OPEN = -1
@@ -64,7 +69,31 @@ def xarm_tool_use_task(robot: str = "primitive", gym_id: str = "hdp/XArmToolUse-
         action_names=STATE_NAMES,
         fps=FPS,
         robot_type="xarm7",
+        step_ends=STEP_ENDS,
+        check_plan=partial(check_plan, top_block="RED" if gym_id == "hdp/XArmToolUseRedOnTop-v0" else None),
     )
+
+
+def check_plan(symbols: Sequence[str], observation: Observation, top_block: str | None = None) -> list[str]:
+    """What is wrong with a plan: each block is dragged once, and after that stacked once.
+
+    Args:
+        symbols: the plan.
+        observation: is not looked at; every start allows the same plans.
+        top_block: the block that has to be stacked last; None: any.
+    """
+    moves, complaints = read_moves(symbols, (["DRAG", "STACK"], BLOCKS))
+    for number, (verb, block) in enumerate(moves, start=1):
+        before = moves[: number - 1]
+        if (verb, block) in before:
+            complaints.append(f"move {number}: {verb} {block} comes a second time")
+        if verb == "STACK" and ("DRAG", block) not in before:
+            complaints.append(f"move {number}: STACK {block} comes before DRAG {block}")
+    complaints += [f"{block} is never stacked" for block in BLOCKS if ("STACK", block) not in moves]
+    stacked = [block for verb, block in moves if verb == "STACK"]
+    if top_block and stacked and stacked[-1] != top_block:
+        complaints.append(f"{stacked[-1]} is stacked last instead of {top_block}")
+    return complaints
 
 
 def xarm_tool_use_red_on_top_task(robot: str = "primitive") -> PlanningTask:

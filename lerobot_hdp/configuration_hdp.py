@@ -10,6 +10,8 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
 
 from .encoders import object_sizes
+from .prompt import encode_prompt
+from .vocabulary import Vocabulary
 
 OBS_SYMBOLIC_PLAN = f"{OBS_PREFIX}symbolic_plan"
 """Dataset column with the plan's token ids; from an environment, the plan's prompt. It has this name because LeRobot
@@ -84,6 +86,8 @@ class HDPConfig(PreTrainedConfig):
             soon as the planner is sure of them, which needs far fewer steps.
         confidence_threshold: how probable a symbol must be for the `confidence` sampler to reveal it.
         num_inference_steps: network calls for a plan; N where the preset says nothing else.
+        prompt: a part of every plan, in words (prompt.py, docs/conditioning.md). None: what the environment asks for.
+        num_candidates: plans that are drawn for each observation, of which the most likely is executed.
 
         compile_model, compile_mode: run the denoiser through `torch.compile`.
         dtype: `float32`, or `bfloat16` for autocast in training and planning.
@@ -124,6 +128,8 @@ class HDPConfig(PreTrainedConfig):
     sampler: str | None = None
     confidence_threshold: float = 0.8
     num_inference_steps: int | None = None
+    prompt: str | None = None
+    num_candidates: int = 1
 
     compile_model: bool = False
     compile_mode: str = "default"
@@ -161,7 +167,7 @@ class HDPConfig(PreTrainedConfig):
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
         if self.width % self.num_heads or self.width % 2:
             raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
-        for name in ("horizon", "symbolic_horizon", "n_action_steps", "num_inference_steps"):
+        for name in ("horizon", "symbolic_horizon", "n_action_steps", "num_inference_steps", "num_candidates"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ParsingError(f"{name} must be at least 1, got {value}")
@@ -171,6 +177,11 @@ class HDPConfig(PreTrainedConfig):
             raise ParsingError(
                 f"num_inference_steps={self.num_inference_steps} is more than {self.num_train_timesteps=}"
             )
+        if self.prompt and self.vocabulary and self.symbolic_horizon:
+            try:
+                encode_prompt(self.prompt, Vocabulary(self.vocabulary), self.symbolic_horizon)
+            except ValueError as error:
+                raise ParsingError(str(error)) from error
 
     def set_dataset_feature_metadata(self, features: dict[str, dict]) -> None:
         """Take over what the dataset says about itself. LeRobot calls this before it builds the policy.

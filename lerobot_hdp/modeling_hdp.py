@@ -1,7 +1,8 @@
 """The planner as a LeRobot policy."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,15 @@ from safetensors import SafetensorError
 from torch import Generator, Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
+from .candidates import PARTIAL_MOTION_CANDIDATES, best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
 from .encoders import StateEncoder
-from .plan import Plan, PlanPrompt
+from .plan import Plan, PlanCheck, PlanPrompt
 from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess, Process, SymbolProcess
-from .sampling import DenoisingState, sample_plan
-from .vocabulary import Vocabulary
+from .prompt import choose_placement, encode_prompt, shared_tokens
+from .sampling import Denoise, DenoisingState, sample_plan
+from .vocabulary import FREE, Vocabulary
 
 
 class Planner(nn.Module):
@@ -66,6 +69,8 @@ class HDPPolicy(PreTrainedPolicy):
 
     config_class = HDPConfig
     name = "hdp"
+    can_score = True
+    """Whether it can say how likely a plan is, and so choose among candidates."""
 
     def __init__(self, config: HDPConfig, dataset_stats: Any = None, dataset_meta: Any = None):
         super().__init__(config)
@@ -141,7 +146,7 @@ class HDPPolicy(PreTrainedPolicy):
 
     def _sample_levels(self, process: Process, batch_size: int) -> Tensor:
         """Levels for the batches of all processes of a distributed run, (processes x B,); see `_corrupt`."""
-        return process.sample_level(_rank_and_world_size()[1] * batch_size, self.noise_seed.device)
+        return process.sample_level(_rank_and_world_size()[1] * batch_size, self._device)
 
     def _corrupt(self, process: Process, clean: Tensor, levels: Tensor) -> Corrupted:
         """Corrupt this process' batch, as one process would corrupt it as a part of the batches of all of them.
@@ -159,18 +164,79 @@ class HDPPolicy(PreTrainedPolicy):
     def plan(
         self,
         batch: dict[str, Tensor],
-        prompt: PlanPrompt | None = None,
+        prompt: str | Sequence[str] | PlanPrompt | None = None,
         generator: Generator | None = None,
         on_step: Callable[[int, DenoisingState], None] | None = None,
+        num_candidates: int | None = None,
+        check: PlanCheck | None = None,
     ) -> Plan:
         """Algorithm 2: make a plan for each observation of a batch, from scratch or around a prompt.
 
         Args:
-            batch: preprocessed observations. `observation.symbolic_plan` among them, as an environment may give it,
-                is a prompt.
-            prompt: the part of the plan that is given.
+            batch: preprocessed observations.
+            prompt: the part of the plan that is given, see `read_prompt`.
             generator: source of all randomness; None: PyTorch's global one.
-            on_step: sees the half-done plan after each step.
+            on_step: sees the half-done plan after each step, and all candidates of it: those of one observation follow
+                each other.
+            num_candidates: k plans are drawn for each observation, and the one that the model itself finds most
+                likely is kept (`candidates.score_plans`). None: as the configuration says, and at least
+                `PARTIAL_MOTION_CANDIDATES` where a part of the motion is given.
+            check: the task's checker. The candidates with the fewest complaints are preferred to all others.
+
+        Raises:
+            ValueError: an observation with NaN or infinity, or a prompt that does not fit.
+        """
+        prompt = self.read_prompt(batch, prompt, generator)
+        k = num_candidates
+        if k is None:
+            partial = prompt.gives_part_of_motion and self.can_score
+            k = max(self.config.num_candidates, PARTIAL_MOTION_CANDIDATES if partial else 1)
+        if k < 1:
+            raise ValueError(f"num_candidates must be at least 1, got {k}")
+        if k == 1:
+            return self._sample(batch, prompt, generator, on_step)
+
+        repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in self.config.input_features}
+        plans = self._sample(repeated, prompt.repeat(k), generator, on_step)
+        scores = torch.stack([self.score(batch, plans.select(slice(i, None, k))) for i in range(k)], dim=1)
+        complaints = None
+        if check is not None:
+            about = plans.validate(lambda index, symbols: check(index // k, symbols))
+            complaints = [[len(found) for found in about[start : start + k]] for start in range(0, len(about), k)]
+        best = best_candidates(scores, complaints)
+        samples = torch.arange(len(best), device=best.device)
+        kept = plans.select(samples * k + best)
+        return replace(kept, scores=scores[samples, best], candidate=best)
+
+    @torch.no_grad()
+    def score(self, batch: dict[str, Tensor], plan: Plan) -> Tensor:
+        """How likely a plan for each observation is under the model, up to scale: (B,), see `score_plans`.
+
+        Raises:
+            ValueError: this planner cannot say.
+        """
+        if not self.can_score:
+            raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
+        processes = self.motion_process, self.symbol_process
+        return score_plans(self._denoiser(batch), *processes, plan.actions, plan.token_ids)
+
+    @torch.no_grad()
+    def read_prompt(
+        self,
+        batch: dict[str, Tensor],
+        prompt: str | Sequence[str] | PlanPrompt | None = None,
+        generator: Generator | None = None,
+    ) -> PlanPrompt:
+        """What is given of each plan of a batch.
+
+        It comes from the argument, else from the configuration (`--policy.prompt`), else from the environment, in
+        `observation.symbolic_plan`. Where words do not say their place in the plan ("... STACK red"), the planner
+        draws one, by one call of the network.
+
+        Args:
+            batch: preprocessed observations.
+            prompt: words (see prompt.py), the same for all samples or for each its own; or token ids and actions.
+            generator: source of randomness; None: PyTorch's global one.
 
         Raises:
             ValueError: an observation with NaN or infinity, or a prompt that does not fit.
@@ -178,33 +244,54 @@ class HDPPolicy(PreTrainedPolicy):
         for key in self.config.input_features:
             if not torch.isfinite(batch[key]).all():
                 raise ValueError(f"{key} holds NaN or infinity: no plan can be made from it")
+        if prompt is None and self.config.prompt:
+            prompt = self.config.prompt
         if prompt is None and OBS_SYMBOLIC_PLAN in batch and self.symbol_process is not None:
             prompt = PlanPrompt(token_ids=batch[OBS_SYMBOLIC_PLAN])
-        self._check_prompt(prompt, self._motion_shape(batch))
-        return self._sample(batch, prompt, generator, on_step)
+        if prompt is None:
+            return PlanPrompt()
+        if not isinstance(prompt, PlanPrompt):
+            texts = [prompt] * self._batch_size(batch) if isinstance(prompt, str) else list(prompt)
+            prompt = PlanPrompt(token_ids=self._place_words(batch, texts, generator))
+        self._check_prompt(prompt, self._batch_size(batch))
+        return prompt
+
+    def _place_words(self, batch: dict[str, Tensor], texts: list[str], generator: Generator | None) -> Tensor:
+        """Token ids of a prompt in words for each sample: (B, H_d)."""
+        if self.symbol_process is None:
+            raise ValueError("this planner models no symbols: it takes no symbolic prompt")
+        if len(texts) != self._batch_size(batch):
+            raise ValueError(f"there are {len(texts)} prompts for {self._batch_size(batch)} observations")
+        length = self.config.symbolic_horizon
+        encoded = {text: encode_prompt(text, self.vocabulary, length).to(self._device) for text in set(texts)}
+        placements = [encoded[text] for text in texts]
+        if all(len(ways) == 1 for ways in placements):
+            return torch.cat(placements)
+        if not isinstance(self.symbol_process, MaskedProcess):
+            raise ValueError("this planner cannot place words after '...': number their positions, as in 11:STACK")
+        # The most corrupted plan, with what is given in any case: its symbols' probabilities are those of the places.
+        given = torch.stack([shared_tokens(ways) for ways in placements])
+        tokens = given.masked_fill(given == FREE, self.symbol_process.mask_id)
+        motion = self.motion_process.prior(self._motion_shape(batch), self._device, generator)
+        k_c = torch.ones(len(texts), device=self._device)
+        logits = self._denoiser(batch)(motion, tokens, k_c, (given == FREE).float().mean(dim=1)).symbols
+        drawn = zip(placements, logits, strict=True)
+        return torch.stack([choose_placement(ways, scores, generator) for ways, scores in drawn])
 
     def _sample(
         self,
         batch: dict[str, Tensor],
-        prompt: PlanPrompt | None,
+        prompt: PlanPrompt,
         generator: Generator | None,
         on_step: Callable[[int, DenoisingState], None] | None,
     ) -> Plan:
-        network, device = self._planning_network, self.noise_seed.device
-        observation = network.encoder(batch)
-
-        def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
-            with torch.autocast(device.type, torch.bfloat16, enabled=self.config.dtype == "bfloat16"):
-                prediction = network.denoiser(motion, symbols, observation, k_c, k_d)
-            return Prediction(*(None if part is None else part.float() for part in prediction))
-
         motion, tokens, probabilities = sample_plan(
-            denoise,
+            self._denoiser(batch),
             self.motion_process,
             self.symbol_process,
             self._motion_shape(batch),
             self.config.symbolic_horizon or 0,
-            device,
+            self._device,
             self.config.num_inference_steps,
             self.config.shared_level,
             prompt,
@@ -212,6 +299,18 @@ class HDPPolicy(PreTrainedPolicy):
             on_step,
         )
         return Plan(motion, tokens, probabilities, self.vocabulary)
+
+    def _denoiser(self, batch: dict[str, Tensor]) -> Denoise:
+        """The denoiser for the observations of a batch."""
+        network = self._planning_network
+        observation = network.encoder(batch)
+
+        def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
+            with torch.autocast(self._device.type, torch.bfloat16, enabled=self.config.dtype == "bfloat16"):
+                prediction = network.denoiser(motion, symbols, observation, k_c, k_d)
+            return Prediction(*(None if part is None else part.float() for part in prediction))
+
+        return denoise
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
@@ -230,27 +329,31 @@ class HDPPolicy(PreTrainedPolicy):
         """The averaged weights, where there are any."""
         return self.planner if self.ema is None else self.ema.module
 
-    def _motion_shape(self, batch: dict[str, Tensor]) -> tuple[int, int, int]:
-        """(B, H_c, D)."""
-        batch_size = len(batch[next(iter(self.config.input_features))])
-        return batch_size, self.config.horizon, self.config.action_feature.shape[0]
+    @property
+    def _device(self) -> torch.device:
+        return self.noise_seed.device
 
     @property
     def _cuda_devices(self) -> list[torch.device]:
-        device = self.noise_seed.device
-        return [device] if device.type == "cuda" else []
+        return [self._device] if self._device.type == "cuda" else []
 
-    def _check_prompt(self, prompt: PlanPrompt | None, motion_shape: tuple[int, int, int]) -> None:
-        if prompt is None:
-            return
+    def _batch_size(self, batch: dict[str, Tensor]) -> int:
+        return len(batch[next(iter(self.config.input_features))])
+
+    def _motion_shape(self, batch: dict[str, Tensor]) -> tuple[int, int, int]:
+        """(B, H_c, D)."""
+        return self._batch_size(batch), self.config.horizon, self.config.action_feature.shape[0]
+
+    def _check_prompt(self, prompt: PlanPrompt, batch_size: int) -> None:
         if prompt.token_ids is not None:
             if self.symbol_process is None:
                 raise ValueError("this planner models no symbols: it takes no symbolic prompt")
-            expected = (motion_shape[0], self.config.symbolic_horizon)
+            expected = (batch_size, self.config.symbolic_horizon)
             if tuple(prompt.token_ids.shape) != expected:
                 raise ValueError(f"token_ids must have the shape {expected}, got {tuple(prompt.token_ids.shape)}")
-        if prompt.actions is not None and tuple(prompt.actions.shape) != motion_shape:
-            raise ValueError(f"actions must have the shape {motion_shape}, got {tuple(prompt.actions.shape)}")
+        expected = (batch_size, self.config.horizon, self.config.action_feature.shape[0])
+        if prompt.actions is not None and tuple(prompt.actions.shape) != expected:
+            raise ValueError(f"actions must have the shape {expected}, got {tuple(prompt.actions.shape)}")
 
     @classmethod
     def _load_as_safetensor(cls, model: "HDPPolicy", model_file: str, map_location: str, strict: bool) -> "HDPPolicy":

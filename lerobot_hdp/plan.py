@@ -1,11 +1,21 @@
 """What a caller of the planner gives and gets."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .vocabulary import FREE, Vocabulary
+
+PlanCheck = Callable[[int, list[str]], list[str]]
+"""(index of the sample, its plan in words) -> complaints about the plan, in words; none about a valid one."""
+
+StepEnds = Sequence[tuple[int, int]]
+"""(tokens, waypoints) until which each step of a plan lasts, e.g. ((6, 7), (12, 13)): the first step is the tokens 0
+to 5 and the waypoints 0 to 6. Tasks whose demonstrations all keep the same time know it (`PlanningTask.step_ends`)."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +50,20 @@ class PlanPrompt:
             return torch.ones_like(self.actions[..., :1], dtype=torch.bool)
         return self.actions_given[..., None]
 
+    @property
+    def gives_part_of_motion(self) -> bool:
+        """Whether some actions are given, but not all."""
+        return self.actions_given is not None and bool(self.actions_given.any()) and not self.actions_given.all()
+
+    def repeat(self, times: int) -> "PlanPrompt":
+        """Each sample's prompt `times` times, one after the other: (B times, ...)."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        return PlanPrompt(**{name: _repeat(value, times) for name, value in given.items()})
+
+
+def _repeat(value: Tensor | None, times: int) -> Tensor | None:
+    return None if value is None else value.repeat_interleave(times, dim=0)
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -52,15 +76,60 @@ class Plan:
         token_probabilities: (B, H_d) the probability with which each token was drawn; 1 where it was given. (B, 0)
             from a planner that draws none: it models no symbols, or continuous ones.
         vocabulary: what the token ids mean.
+        scores: (B,) the score by which the plan was kept (`candidates.score_plans`); None: there was no choice.
+        candidate: (B,) the number of the candidate that was kept; None: there was no choice.
     """
 
     actions: Tensor
     token_ids: Tensor | None = None
     token_probabilities: Tensor | None = None
     vocabulary: Vocabulary | None = None
+    scores: Tensor | None = None
+    candidate: Tensor | None = None
 
     def symbols(self, index: int = 0) -> list[str]:
         """The symbolic plan of one sample in words, without PAD."""
         if self.token_ids is None or self.vocabulary is None:
             return []
         return self.vocabulary.decode(self.token_ids[index])
+
+    def select(self, samples: Tensor | slice) -> "Plan":
+        """The plans of some of the samples."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        tensors: dict[str, Any] = {name: value[samples] for name, value in values.items() if isinstance(value, Tensor)}
+        return replace(self, **tensors)
+
+    def validate(self, check: PlanCheck) -> list[list[str]]:
+        """What is wrong with the symbolic plan of each sample, in words: B lists, empty for a valid plan.
+
+        Args:
+            check: the task's checker, with the observations, e.g.
+                `lambda i, symbols: task.check_plan(symbols, observations[i])`.
+        """
+        return [check(index, self.symbols(index)) for index in range(len(self.actions))]
+
+    def describe(self, index: int = 0, step_ends: StepEnds | None = None) -> str:
+        """The plan of one sample as text: a line for each step, with the probability of each token.
+
+        Args:
+            index: of the sample.
+            step_ends: the tokens and waypoints of each step, to say which waypoints it covers; None: six tokens to a
+                line, without waypoints.
+        """
+        words = self.symbols(index)
+        if not words:
+            return "(no symbols)"
+        assert self.token_probabilities is not None
+        drawn = zip(words, self.token_probabilities[index].tolist(), strict=False)
+        tokens = [f"{word} {probability:.2f}" for word, probability in drawn]
+        if step_ends is None:
+            return "\n".join("  ".join(tokens[start : start + 6]) for start in range(0, len(tokens), 6))
+        lines = []
+        for (first_token, first), (next_token, stop) in pairwise([(0, 0), *step_ends]):
+            if tokens[first_token:next_token]:
+                waypoints = f"waypoints {first}-{stop - 1}"
+                lines.append(f"{waypoints:18}" + "  ".join(tokens[first_token:next_token]))
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return "\n\n".join(self.describe(index) for index in range(len(self.actions)))

@@ -7,8 +7,6 @@ from torch import Tensor
 
 FREE = -1
 """Token id, in a prompt, of a position that the planner decides."""
-FREE_WORD = "_"
-"""The same in words."""
 
 
 class Vocabulary:
@@ -43,6 +41,13 @@ class Vocabulary:
     def mask_id(self) -> int:
         return len(self.symbols)
 
+    def __contains__(self, word: str) -> bool:
+        return word.upper() in self._ids
+
+    def token_id(self, word: str) -> int:
+        """The id of a symbol; case does not matter."""
+        return self._ids[word.upper()]
+
     def encode(self, plan: str | Sequence[str], length: int) -> Tensor:
         """A whole plan as token ids, filled with PAD: (length,) int64.
 
@@ -52,18 +57,17 @@ class Vocabulary:
         Raises:
             ValueError: an unknown symbol, or more symbols than `length`.
         """
-        return self._to_ids(plan, length, fill=self.pad_id, allow_free=False)
-
-    def encode_prompt(self, prompt: str | Sequence[str], length: int) -> Tensor:
-        """The beginning of a plan as token ids, FREE where the planner decides: (length,) int64.
-
-        Args:
-            prompt: like a plan, and `_` for a position that is left open; so is what comes after the last word.
-
-        Raises:
-            ValueError: an unknown symbol, or more words than `length`.
-        """
-        return self._to_ids(prompt, length, fill=FREE, allow_free=True)
+        words = plan.split() if isinstance(plan, str) else list(plan)
+        if len(words) > length:
+            raise ValueError(f"{len(words)} symbols do not fit into a plan of {length}")
+        ids = torch.full((length,), self.pad_id, dtype=torch.int64)
+        for position, word in enumerate(words):
+            if word not in self:
+                raise ValueError(
+                    f"unknown symbol {word!r} at position {position + 1}; the symbols are {' '.join(self.symbols)}"
+                )
+            ids[position] = self.token_id(word)
+        return ids
 
     def decode(self, ids: Iterable[int] | Tensor) -> list[str]:
         """The symbols of a plan, without the PAD at its end.
@@ -78,18 +82,3 @@ class Vocabulary:
             if not 0 <= i < len(self):
                 raise ValueError(f"token id {i} at position {position} is none of the {len(self)} symbols")
         return [self.symbols[i] for i in ids]
-
-    def _to_ids(self, words: str | Sequence[str], length: int, fill: int, allow_free: bool) -> Tensor:
-        words = words.split() if isinstance(words, str) else list(words)
-        if len(words) > length:
-            raise ValueError(f"{len(words)} symbols do not fit into a plan of {length}")
-        ids = torch.full((length,), fill, dtype=torch.int64)
-        for position, word in enumerate(words):
-            if allow_free and word == FREE_WORD:
-                continue
-            if word.upper() not in self._ids:
-                raise ValueError(
-                    f"unknown symbol {word!r} at position {position + 1}; the symbols are {' '.join(self.symbols)}"
-                )
-            ids[position] = self._ids[word.upper()]
-        return ids

@@ -4,7 +4,10 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -13,6 +16,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 
 import lerobot_policy_hdp  # noqa: F401 (registers the policy and the environments)
+from dataset_tools.demonstration import expert_generator
+from dataset_tools.experts import sort_blocks_2d
+from lerobot_hdp import HDPConfig
+from lerobot_hdp.modeling_hdp import HDPPolicy
 
 REPOSITORY = Path(__file__).parents[1]
 N_EPISODES = 30
@@ -75,3 +82,87 @@ def batch(dataset):
     """The first frames of four episodes, collated as LeRobot's data loader does."""
     items = [dataset[episode * HORIZON] for episode in range(4)]
     return torch.utils.data.default_collate(items)
+
+
+@pytest.fixture
+def inputs(make_planner, batch):
+    """The preprocessed observations of the same."""
+    _, preprocessor, _ = make_planner()
+    names = ("observation.state", "observation.environment_state")
+    return {name: value for name, value in preprocessor(batch).items() if name in names}
+
+
+class Demonstrations(NamedTuple):
+    """Starts, and what the expert does there: n observations, actions in metres, and plans in words."""
+
+    observations: list[dict[str, np.ndarray]]
+    batch: dict[str, torch.Tensor]
+    plans: list[list[str]]
+
+
+class Trained(NamedTuple):
+    """A planner that can do its task, and demonstrations that it has not seen, of the environment's seeds 0, 1, ..."""
+
+    policy: HDPPolicy
+    postprocessor: object
+    env: gym.Env
+    unseen: Demonstrations
+    inputs: dict[str, torch.Tensor]
+    """The preprocessed observations of the unseen demonstrations, ..."""
+    actions: torch.Tensor
+    """... and their normalised actions."""
+
+
+SYMBOLIC_HORIZON = 20
+"""Of the trained planner: two more than a plan has, so that plans end in PAD."""
+
+
+def demonstrate(env: gym.Env, seeds) -> Demonstrations:
+    """Let the expert demonstrate from each seed."""
+    observations, actions, plans = [], [], []
+    for seed in seeds:
+        observations.append(env.reset(seed=seed)[0])
+        demonstration = sort_blocks_2d(env, expert_generator(seed))
+        actions.append(demonstration.waypoints)
+        plans.append(demonstration.remaining_symbols(0))
+    batch = {
+        "observation.state": torch.tensor(np.stack([o["agent_pos"] for o in observations])),
+        "observation.environment_state": torch.tensor(np.stack([o["environment_state"] for o in observations])),
+        "action": torch.tensor(np.stack(actions)),
+    }
+    return Demonstrations(observations, batch, plans)
+
+
+@pytest.fixture(scope="session")
+def trained(dataset) -> Trained:
+    """Two-block sorting, learned in half a minute: a small planner, the whole data set in memory."""
+    env = gym.make("hdp/BlockSorting2D-v0", n_blocks=2, waypoints_per_pose=1, disable_env_checker=True)
+    seen, unseen = demonstrate(env, range(1000, 1400)), demonstrate(env, range(40))
+    small = {"horizon": HORIZON, "symbolic_horizon": SYMBOLIC_HORIZON, "num_layers": 2, "width": 64}
+    config = HDPConfig(**small, num_train_timesteps=50, ema_max_decay=0.99, device="cpu", push_to_hub=False)
+    torch.manual_seed(0)
+    policy = make_policy(config, ds_meta=dataset.meta)
+    rows = {key: value.flatten(0, -2) for key, value in seen.batch.items()}
+    stats = {key: {"min": value.min(dim=0).values, "max": value.max(dim=0).values} for key, value in rows.items()}
+    preprocessor, postprocessor = make_pre_post_processors(config, dataset_stats=stats)
+
+    tokens = torch.stack([policy.vocabulary.encode(plan, SYMBOLIC_HORIZON) for plan in seen.plans])
+    data = preprocessor({**seen.batch, "observation.symbolic_plan": tokens})
+    keys, steps, peak_lr = [*seen.batch, "observation.symbolic_plan"], 400, 3e-3
+    optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, peak_lr, steps, pct_start=0.1)
+    policy.train()
+    for _ in range(steps):
+        chosen = torch.randint(len(tokens), (64,))
+        policy.forward({key: data[key][chosen] for key in keys})[0].backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        optimizer.step()
+        optimizer.zero_grad()
+        schedule.step()
+        policy.update()
+    policy.eval()
+    policy.config.num_inference_steps = 20
+
+    inputs = preprocessor(unseen.batch)
+    observed = {key: inputs[key] for key in config.input_features}
+    return Trained(policy, postprocessor, env, unseen, observed, inputs["action"])

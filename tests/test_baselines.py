@@ -15,6 +15,7 @@ from lerobot.scripts import lerobot_eval, lerobot_train
 from safetensors.torch import load_file
 
 from lerobot_hdp import FREE, PlanPrompt
+from lerobot_hdp.prompt import encode_prompt
 
 from .conftest import HORIZON, TASK_FLAGS, TINY_PLANNER
 
@@ -220,7 +221,7 @@ class TestContract:
 class TestContinuousSymbols:
     def test_given_symbols_stay_fixed_in_every_step_but_for_their_noise(self, make_planner, batch, planner):
         policy, preprocessor, _ = make_planner(planner)
-        token_ids = policy.vocabulary.encode_prompt("PICK _ S1 PLACE", 18).expand(4, -1)
+        token_ids = encode_prompt("PICK _ S1 PLACE", policy.vocabulary, 18).expand(4, -1)
         states = []
         prompt = PlanPrompt(token_ids=token_ids)
         inputs = observation(preprocessor(batch))

@@ -1,7 +1,10 @@
 """LeRobot's own commands, and `hdp-plan`, run as a user runs them."""
 
 import json
+import re
 import shutil
+import subprocess
+from html import unescape
 from pathlib import Path
 
 import pytest
@@ -89,6 +92,7 @@ def test_lerobot_eval_scores_the_policy(checkpoint, tmp_path):
     run_command(
         "lerobot-eval",
         f"--policy.path={checkpoint}",
+        "--policy.prompt=... PICK A _ PLACE _ _",
         *ENV_FLAGS,
         "--eval.n_episodes=4",
         "--eval.batch_size=2",
@@ -130,23 +134,128 @@ def test_an_output_folder_that_holds_a_run_is_not_overwritten(dataset_root, run_
     assert "already exists" in result.stderr
 
 
-def test_hdp_plan_prints_and_draws_a_plan(checkpoint, tmp_path):
-    """The task is in the checkpoint's training configuration."""
-    result = run_command("hdp-plan", f"--policy.path={checkpoint}", f"--output_dir={tmp_path}", "--prompt=PICK b s1")
-    assert "plan:\n    PICK B S1 " in result.stdout
-    assert "executed: score" in result.stdout
+@pytest.fixture(scope="module")
+def planned(checkpoint, tmp_path_factory) -> tuple[str, Path]:
+    """What `hdp-plan` printed, and the folder that it wrote to. The task is in the checkpoint's configuration."""
+    folder = tmp_path_factory.mktemp("plan")
+    flags = (f"--output_dir={folder}", "--prompt=PICK b from s1", f"--html={folder / 'page' / 'plan.html'}")
+    result = run_command("hdp-plan", f"--policy.path={checkpoint}", "--policy.num_candidates=2", "--check=true", *flags)
+    return result.stdout, folder
+
+
+def test_hdp_plan_prints_and_draws_a_plan(planned):
+    printed, folder = planned
+    assert "plan:\n    waypoints 0-6     PICK 1.00  B 1.00  S1 1.00 " in printed
+    assert "checked: " in printed
+    assert "executed: score" in printed
     from PIL import Image
 
-    assert Image.open(tmp_path / "plan.png").size[0] > 300
-    assert Image.open(tmp_path / "denoising.gif").n_frames == 11
+    assert Image.open(folder / "plan.png").size[0] > 300
+    assert Image.open(folder / "denoising.gif").n_frames == 11
+
+
+class TestPage:
+    """The page of `hdp-plan --html`, in a real browser without a network."""
+
+    @pytest.fixture(scope="class")
+    def seen(self, planned, tmp_path_factory) -> list[dict]:
+        """What the page shows at first, and after each movement of a slider."""
+        html = (planned[1] / "page" / "plan.html").read_text()
+        errors = "<script>const errors = []; addEventListener('error', (event) => errors.push(event.message));</script>"
+        html = html.replace("<head>", "<head>" + errors).replace("</body>", f"<script>{MOVE_SLIDERS}</script></body>")
+        page = tmp_path_factory.mktemp("browser") / "plan.html"
+        page.write_text(html)
+        [report] = re.findall(r'<pre id="report">(.*?)</pre>', open_in_browser(page), re.DOTALL)
+        return json.loads(unescape(report))
+
+    def test_needs_nothing_but_itself(self, planned):
+        html = (planned[1] / "page" / "plan.html").read_text()
+        assert "PLAN_DATA;" not in html
+        assert not re.search(r"https?://|(src|href)=\"(?!data:)", html)
+
+    def test_loads_without_errors(self, seen):
+        assert seen[-1]["errors"] == []
+        assert seen[0]["masked"] == 0
+        assert seen[0]["given"] == ["PICK", "B", "S1"]
+        assert seen[0]["at"] == ["waypoint 0", "step 10 of 10"]
+
+    def test_the_time_slider_moves_the_tool_the_scene_and_the_step(self, seen):
+        first, fifth, ninth = seen[:3]
+        assert first["active"] == fifth["active"] == first["words"][:6]
+        assert ninth["active"] == first["words"][6:12]
+        assert first["tool"] != fifth["tool"] != ninth["tool"]
+        assert len({look["frame"] for look in (first, fifth, ninth)}) == 3
+        assert first["path"] == ninth["path"]
+
+    def test_the_denoising_slider_hides_tokens_and_deforms_the_path(self, seen):
+        plan, noise, between = seen[2:5]
+        assert noise["masked"] == len(plan["words"]) - 3
+        assert noise["given"] == ["PICK", "B", "S1"]
+        assert 0 <= between["masked"] < noise["masked"]
+        assert len({look["path"] for look in (plan, noise, between)}) == 3
+        assert noise["active"] == []
+        assert noise["at"][1] == "step 0 of 10"
+
+    def test_the_time_slider_leads_back_to_the_finished_plan(self, seen):
+        assert seen[5]["masked"] == 0
+        assert seen[5]["at"] == ["waypoint 18", "step 10 of 10"]
+        assert seen[5]["path"] == seen[0]["path"]
+
+
+MOVE_SLIDERS = """
+    const seen = [];
+    const texts = (selector) => [...document.querySelectorAll(selector)].map((token) => token.textContent);
+    const look = () => seen.push({
+        errors, words: texts("#tokens .token"), active: texts("#tokens .token.active"),
+        given: texts("#tokens .token.given"), masked: texts("#tokens .token.masked").length,
+        frame: document.getElementById("frame").getAttribute("href"),
+        path: document.getElementById("path").getAttribute("points"),
+        tool: ["cx", "cy"].map((name) => document.getElementById("tool").getAttribute(name)),
+        at: ["time-at", "denoising-at"].map((id) => document.getElementById(id).textContent),
+    });
+    const move = (id, value) => {
+        document.getElementById(id).value = value;
+        document.getElementById(id).dispatchEvent(new Event("input"));
+        look();
+    };
+    look(); move("time", 5); move("time", 9); move("denoising", 0); move("denoising", 6); move("time", 18);
+    const report = document.createElement("pre");
+    report.id = "report";
+    report.textContent = JSON.stringify(seen);
+    document.body.append(report);
+"""
+
+
+def open_in_browser(page: Path) -> str:
+    """The page's DOM after its scripts have run. Debian's package `chromium` is enough."""
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        pytest.skip("there is no Chromium on this machine (Debian, Ubuntu: apt-get install chromium)")
+    flags = ("--headless", "--no-sandbox", "--disable-gpu", "--host-resolver-rules=MAP * ~NOTFOUND")
+    profile = f"--user-data-dir={page.parent / 'profile'}"
+    command = [browser, *flags, profile, "--dump-dom", page.as_uri()]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+
+
+def test_hdp_plan_explains_a_recorded_motion(checkpoint):
+    """Of the dataset in the checkpoint's training configuration."""
+    result = run_command("hdp-plan", f"--policy.path={checkpoint}", "--explain=2")
+    first, *_ = result.stdout[result.stdout.index("episode 2:") :].splitlines()[1:]
+    assert first.startswith("    waypoints 0-6 ")
+    assert "recorded" in result.stdout
 
 
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--prompt=PICK D"], "unknown symbol 'D' at position 2; the symbols are PAD A B PICK PLACE S1 S2 AUX"),
-        (["--prompt=" + "PICK " * 19], "19 symbols do not fit into a plan of 18"),
+        (
+            ["--prompt=PICK D"],
+            "unknown symbol 'D' (word 2 of the prompt); the symbols are PAD A B PICK PLACE S1 S2 AUX",
+        ),
+        (["--policy.prompt=PICK D"], "unknown symbol 'D' (word 2 of the prompt)"),
+        (["--prompt=" + "PICK " * 19], "does not fit into a plan of 18 symbols"),
         (["--policy.path=nowhere/to/be/found"], "nowhere/to/be/found"),
+        ([f"--explain={N_EPISODES}"], f"--explain={N_EPISODES}: the dataset has the episodes 0 to {N_EPISODES - 1}"),
     ],
 )
 def test_hdp_plan_answers_bad_input_with_one_line(checkpoint, tmp_path, flags, message):

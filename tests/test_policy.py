@@ -7,6 +7,7 @@ from lerobot.policies import make_policy
 
 from lerobot_hdp import FREE, HDPConfig, PlanPrompt
 from lerobot_hdp.modeling_hdp import HDPPolicy
+from lerobot_hdp.prompt import encode_prompt
 
 from .conftest import HORIZON, TINY_PLANNER
 
@@ -115,7 +116,7 @@ def test_the_same_generator_makes_the_same_plan(make_planner, batch):
 
 def test_given_symbols_stay_fixed_in_every_step(make_planner, batch):
     policy, preprocessor, _ = make_planner()
-    token_ids = policy.vocabulary.encode_prompt("PICK _ S1 PLACE", 18).expand(4, -1)
+    token_ids = encode_prompt("PICK _ S1 PLACE", policy.vocabulary, 18).expand(4, -1)
     states = []
     prompt = PlanPrompt(token_ids=token_ids)
     plan = policy.eval().plan(observation(preprocessor(batch)), prompt, on_step=lambda _, state: states.append(state))
@@ -353,6 +354,7 @@ class TestBadInput:
             {"horizon": 0},
             {"horizon": 10, "n_action_steps": 11},
             {"num_inference_steps": 101},
+            {"num_candidates": 0},
         ],
     )
     def test_impossible_settings(self, field):

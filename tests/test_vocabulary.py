@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_hdp import FREE, Vocabulary
+from lerobot_hdp import Vocabulary
 
 VOCABULARY = Vocabulary(["PAD", "A", "B", "PICK", "PLACE", "S1"])
 
@@ -18,10 +18,6 @@ def test_case_and_spacing_do_not_matter():
     assert torch.equal(VOCABULARY.encode("  pick   a", 3), VOCABULARY.encode(["PICK", "A"], 3))
 
 
-def test_a_prompt_leaves_open_what_it_does_not_say():
-    assert VOCABULARY.encode_prompt("PICK _ S1", length=5).tolist() == [3, FREE, 5, FREE, FREE]
-
-
 def test_the_mask_is_no_symbol():
     assert VOCABULARY.mask_id == len(VOCABULARY) == 6
     with pytest.raises(ValueError, match="token id 6 at position 0"):
@@ -30,12 +26,12 @@ def test_the_mask_is_no_symbol():
 
 def test_an_unknown_symbol_is_named_with_its_place_and_the_choices():
     with pytest.raises(ValueError, match=r"unknown symbol 'PIKC' at position 2; the symbols are PAD A B PICK"):
-        VOCABULARY.encode_prompt("PICK PIKC", length=4)
+        VOCABULARY.encode("PICK PIKC", length=4)
 
 
-def test_a_prompt_longer_than_the_plan_is_refused():
+def test_a_plan_longer_than_the_horizon_is_refused():
     with pytest.raises(ValueError, match="3 symbols do not fit into a plan of 2"):
-        VOCABULARY.encode_prompt("PICK A S1", length=2)
+        VOCABULARY.encode("PICK A S1", length=2)
 
 
 def test_a_free_position_is_no_part_of_a_whole_plan():

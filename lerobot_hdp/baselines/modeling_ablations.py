@@ -12,8 +12,10 @@ class DiffuserPolicy(HDPPolicy):
 class JointDiffuserPolicy(HDPPolicy):
     config_class = JointDiffuserConfig
     name = "joint_diffuser"
+    can_score = False
 
 
 class SeparateDiffuserPolicy(HDPPolicy):
     config_class = SeparateDiffuserConfig
     name = "separate_diffuser"
+    can_score = False

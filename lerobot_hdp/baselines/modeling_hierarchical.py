@@ -97,6 +97,7 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
 
     config_class = HierarchicalDiffuserConfig
     name = "hd"
+    can_score = False
 
     def _make_planner(self) -> HierarchicalPlanner:
         return HierarchicalPlanner(self.config)

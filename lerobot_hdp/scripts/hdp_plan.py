@@ -1,7 +1,8 @@
-"""`hdp-plan`: make one plan, print it in words, draw it, and execute it.
+"""`hdp-plan`: make one plan, print it in words, draw it, and execute it; or explain a recorded motion in words.
 
 Example:
-    hdp-plan --policy.path=outputs/train/run/checkpoints/last/pretrained_model --seed=3 --prompt="PICK B"
+    hdp-plan --policy.path=outputs/train/run/checkpoints/last/pretrained_model --prompt="PICK B" --html=plan.html
+    hdp-plan --policy.path=outputs/train/run/checkpoints/last/pretrained_model --explain=7
 """
 
 import logging
@@ -9,16 +10,21 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import indent
 from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import torch
 from draccus.utils import ParsingError
 from lerobot import envs, policies  # noqa: F401 (registers LeRobot's own)
 from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors, preprocess_observation
 from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from torch import Tensor
@@ -26,12 +32,13 @@ from torch import Tensor
 from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
 from lerobot_hdp.drawing import MASK_WORD, PlanPicture, draw_plan, save_animation
 from lerobot_hdp.modeling_hdp import HDPPolicy
+from lerobot_hdp.page import PageState, PlanPage, write_page
 from lerobot_hdp.plan import Plan, PlanPrompt
 from lerobot_hdp.sampling import DenoisingState
-from lerobot_hdp.vocabulary import FREE
 
 WORDS_PER_ROW = 6
-ANIMATION_FRAMES = 40
+MOST_STATES = 40
+"""Denoising steps that are drawn."""
 
 
 @dataclass
@@ -42,15 +49,23 @@ class PlanConfig:
         policy: the planner, by `--policy.path=` (a checkpoint's `pretrained_model` folder or a Hub repository).
         env: the task. None: the one in the checkpoint's training configuration.
         seed: seed of the start and of the plan.
-        prompt: the beginning of the plan, in words, with `_` for a symbol that the planner chooses.
+        prompt: a part of the plan in words, e.g. "PICK B ..." or "... STACK red" (docs/conditioning.md).
+        check: prefer, among `--policy.num_candidates` plans, those without complaints by the task's checker.
         output_dir: where the pictures go.
+        html: file for a page with the plan, its execution and its denoising, to open in a browser. None: no page.
+        explain: number of an episode of the dataset, whose motion is put into words; nothing is planned or drawn.
+        dataset: the dataset. None: the one in the checkpoint's training configuration.
     """
 
     policy: PreTrainedConfig | None = None
     env: EnvConfig | None = None
     seed: int = 0
     prompt: str = ""
+    check: bool = False
     output_dir: Path = Path("outputs/plan")
+    html: Path | None = None
+    explain: int | None = None
+    dataset: DatasetConfig | None = None
 
     def __post_init__(self):
         path = parser.get_path_arg("policy")
@@ -59,8 +74,9 @@ class PlanConfig:
         overrides = parser.get_cli_overrides("policy") or []
         self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         self.policy.pretrained_path = Path(path)
-        if self.env is None:
-            self.env = TrainPipelineConfig.from_pretrained(path).env
+        trained = TrainPipelineConfig.from_pretrained(path)
+        self.env = self.env or trained.env
+        self.dataset = self.dataset or trained.dataset
         if self.env is None:
             raise ValueError("the checkpoint names no task: choose one with --env.type=hdp --env.task=...")
 
@@ -73,17 +89,50 @@ class Result(NamedTuple):
     """What became of a plan.
 
     Attributes:
-        symbols: the plan in words, without PAD.
+        text: the plan in words, see `Plan.describe`.
+        complaints: what the task's checker has against the symbols; None: the task has no checker.
         score: of the episode, in [0, 1].
         is_success: what the environment says.
-        picture, animation: the files that were written.
+        files: what was written, by what it is.
     """
 
-    symbols: list[str]
+    text: str
+    complaints: list[str] | None
     score: float
     is_success: bool
-    picture: Path
-    animation: Path
+    files: dict[str, Path]
+
+
+class Recorder:
+    """The plan at every denoising step, in the units and pixels of one environment.
+
+    Attributes:
+        states: step, motion and tokens, of all candidates.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv, policy: HDPPolicy, unnormalise: Callable[[Tensor], np.ndarray]):
+        self.env, self.policy, self.unnormalise = env, policy, unnormalise
+        self.states: list[DenoisingState] = []
+
+    def __call__(self, step: int, state: DenoisingState) -> None:
+        self.states.append(state)
+
+    def page_states(self, plan: Plan) -> list[PageState]:
+        """Up to MOST_STATES of the steps of the candidate that was kept, and the plan itself."""
+        kept = 0 if plan.candidate is None else int(plan.candidate[0])
+        last = len(self.states) - 1
+        length = max(len(plan.symbols()), 1)
+        chosen = sorted({round(i) for i in np.linspace(0, last, min(MOST_STATES, last + 1))})
+        states = [self._state(i, self.states[i].motion[kept], self.states[i].tokens, kept, length) for i in chosen]
+        return [*states[:-1], self._state(last, plan.actions[0], plan.token_ids, 0, length)]
+
+    def _state(self, step: int, motion: Tensor, tokens: Tensor | None, kept: int, length: int) -> PageState:
+        actions = self.unnormalise(motion)
+        words: list[str | None] = []
+        if tokens is not None:
+            shown = [*self.policy.vocabulary.symbols, None]
+            words = [shown[i] for i in tokens[kept, :length].tolist()]
+        return PageState(step, _project(self.env, actions), actions[:, -1], words)
 
 
 def make_plan(config: PlanConfig) -> Result:
@@ -93,85 +142,107 @@ def make_plan(config: PlanConfig) -> Result:
         ValueError: the policy is no planner of this package, or the prompt does not fit.
     """
     set_seed(config.seed)
-    policy = make_policy(config.policy, env_cfg=config.env)
-    if not isinstance(policy, HDPPolicy):
-        raise ValueError(f"hdp-plan draws the plans of `hdp` policies, not of `{config.policy.type}`")
-    policy.eval()
-    preprocessor, postprocessor = make_pre_post_processors(
-        config.policy,
-        config.policy.pretrained_path,
-        preprocessor_overrides={"device_processor": {"device": policy.config.device}},
-    )
+    policy, preprocessor, postprocessor = _load(config)
     env_preprocessor, _ = make_env_pre_post_processors(config.env, config.policy)
+    task = getattr(config.env, "planning_task", None)
     vector_envs = make_env(config.env, n_envs=1)
     try:
         env = next(iter(vector_envs[config.env.type].values()))
         observation, _ = env.reset(seed=config.seed)
+        raw = {key: value[0] for key, value in observation.items() if isinstance(value, np.ndarray)}
         batch = preprocessor(env_preprocessor(preprocess_observation(observation)))
-        prompt = _prompt(config, policy, batch)
-
-        states: list[DenoisingState] = []
-        plan = policy.plan(batch, prompt, on_step=lambda _, state: states.append(state))
+        prompt = policy.read_prompt(batch, config.prompt or None)
 
         def unnormalise(motion: Tensor) -> np.ndarray:
-            return postprocessor(motion[0]).numpy()
+            return postprocessor(motion).numpy()
+
+        def check(_: int, symbols: list[str]) -> list[str]:
+            return task.check_plan(symbols, raw)
+
+        recorder = Recorder(env, policy, unnormalise)
+        plan = policy.plan(batch, prompt, on_step=recorder, check=check if task and config.check else None)
+        start, states = env.call("render")[0], recorder.page_states(plan)
+        given = [False] * len(states[-1].words)
+        if prompt.tokens_mask is not None:
+            given = prompt.tokens_mask[0, : len(given)].tolist()
 
         config.output_dir.mkdir(parents=True, exist_ok=True)
-        picture, animation = _draw(config, env, policy, plan, prompt, states, unnormalise)
-        score, is_success = _execute(env, unnormalise(plan.actions))
-        return Result(plan.symbols(), score, is_success, picture, animation)
+        files = _draw(config, start, states, given)
+        score, is_success, frames = _execute(env, unnormalise(plan.actions[0]), render=config.html is not None)
+        complaints = check(0, plan.symbols()) if task and policy.vocabulary else None
+        step_ends = task.step_ends if task else None
+        if config.html is not None:
+            probabilities = plan.token_probabilities[0, : len(given)].tolist()
+            about = [_outcome(score, is_success), f"seed {config.seed}", *(complaints or [])]
+            if config.prompt:
+                about.insert(0, f"prompt: {config.prompt}")
+            write_page(PlanPage(about, start, frames, states, probabilities, given, step_ends), config.html)
+            files["page"] = config.html
+        return Result(plan.describe(0, step_ends), complaints, score, is_success, files)
     finally:
         close_envs(vector_envs)
 
 
-def _prompt(config: PlanConfig, policy: HDPPolicy, batch: dict[str, Tensor]) -> PlanPrompt | None:
-    """The prompt from the command line, else the environment's own."""
-    if config.prompt:
-        if policy.vocabulary is None:
-            raise ValueError("this planner models no symbols: it takes no --prompt")
-        ids = policy.vocabulary.encode_prompt(config.prompt, policy.config.symbolic_horizon)
-        return PlanPrompt(token_ids=ids[None].to(policy.config.device))
-    if OBS_SYMBOLIC_PLAN in batch:
-        return PlanPrompt(token_ids=batch[OBS_SYMBOLIC_PLAN])
-    return None
+def explain(config: PlanConfig) -> str:
+    """What a recorded motion does, in the planner's words, and what the dataset says that it does.
+
+    Raises:
+        ValueError: the planner has no symbols, or the dataset has no such episode or another horizon.
+    """
+    set_seed(config.seed)
+    policy, preprocessor, _ = _load(config)
+    if policy.vocabulary is None:
+        raise ValueError("this planner models no symbols: it cannot explain a motion")
+    source = config.dataset
+    if source is None:
+        raise ValueError("the checkpoint names no dataset: choose one with --dataset.repo_id=... --dataset.root=...")
+    dataset = LeRobotDataset(source.repo_id, root=source.root, video_backend="pyav")
+    if not 0 <= config.explain < dataset.num_episodes:
+        raise ValueError(f"--explain={config.explain}: the dataset has the episodes 0 to {dataset.num_episodes - 1}")
+    episode = dataset.meta.episodes[config.explain]
+    first, stop = episode["dataset_from_index"], episode["dataset_to_index"]
+    if stop - first != policy.config.horizon:
+        raise ValueError(f"the episode has {stop - first} frames, the planner's horizon is {policy.config.horizon}")
+    item = dataset[first]
+    actions = torch.stack([dataset[index]["action"] for index in range(first, stop)])
+    observed = {key: item[key][None] for key in policy.config.input_features}
+    batch = preprocessor({**observed, "action": actions[None]})
+    plan = policy.plan(batch, PlanPrompt(actions=batch["action"]))
+    task = getattr(config.env, "planning_task", None)
+    recorded = policy.vocabulary.decode(item[OBS_SYMBOLIC_PLAN])
+    agreement = "the recorded plan says the same" if recorded == plan.symbols() else f"recorded: {' '.join(recorded)}"
+    return (
+        f"episode {config.explain}:\n{indent(plan.describe(0, task.step_ends if task else None), '    ')}\n{agreement}"
+    )
 
 
-def _draw(
-    config: PlanConfig,
-    env: gym.vector.VectorEnv,
-    policy: HDPPolicy,
-    plan: Plan,
-    prompt: PlanPrompt | None,
-    states: list[DenoisingState],
-    unnormalise: Callable[[Tensor], np.ndarray],
-) -> tuple[Path, Path]:
-    """Write `plan.png` and `denoising.gif`, and say where they are."""
-    scene = env.call("render")[0]
-    length = max(len(plan.symbols()), 1)
-    rows = -(-length // WORDS_PER_ROW) if policy.vocabulary else 0
-    given = (prompt.token_ids[0] != FREE).tolist() if prompt is not None else None
-
-    def words(tokens: Tensor | None) -> list[str]:
-        if tokens is None:
-            return []
-        shown = [*policy.vocabulary.symbols, MASK_WORD]
-        return [shown[i] for i in tokens[0, :length].tolist()]
-
-    def picture(motion: Tensor, tokens: Tensor | None, caption: str):
-        actions = unnormalise(motion)
-        path = _project(env, actions, scene)
-        return draw_plan(PlanPicture(scene, path, actions[:, -1], words(tokens), given, caption), rows)
-
-    last = len(states) - 1
-    chosen = sorted({round(i) for i in np.linspace(0, last, min(ANIMATION_FRAMES, last + 1))})
-    frames = [picture(states[i].motion, states[i].tokens, f"step {i} of {last}") for i in chosen]
-    picture_file, animation_file = config.output_dir / "plan.png", config.output_dir / "denoising.gif"
-    picture(plan.actions, plan.token_ids, f"plan from seed {config.seed}").save(picture_file)
-    save_animation(frames, animation_file)
-    return picture_file, animation_file
+def _load(config: PlanConfig) -> tuple[HDPPolicy, PolicyProcessorPipeline, PolicyProcessorPipeline]:
+    """The planner, its preprocessor and its postprocessor."""
+    policy = make_policy(config.policy, env_cfg=config.env)
+    if not isinstance(policy, HDPPolicy):
+        raise ValueError(f"hdp-plan draws the plans of `hdp` policies, not of `{config.policy.type}`")
+    policy.eval()
+    device = {"device_processor": {"device": policy.config.device}}
+    path = config.policy.pretrained_path
+    return policy, *make_pre_post_processors(config.policy, path, preprocessor_overrides=device)
 
 
-def _project(env: gym.vector.VectorEnv, actions: np.ndarray, scene: np.ndarray) -> np.ndarray:
+def _draw(config: PlanConfig, scene: np.ndarray, states: list[PageState], given: list[bool]) -> dict[str, Path]:
+    """Write `plan.png` and `denoising.gif`."""
+    rows = -(-len(states[-1].words) // WORDS_PER_ROW)
+
+    def picture(state: PageState, caption: str):
+        words = [MASK_WORD if word is None else word for word in state.words]
+        return draw_plan(PlanPicture(scene, state.path, state.gripper, words, given, caption), rows)
+
+    files = {"picture": config.output_dir / "plan.png", "animation": config.output_dir / "denoising.gif"}
+    picture(states[-1], f"plan from seed {config.seed}").save(files["picture"])
+    frames = [picture(state, f"step {state.step} of {states[-1].step}") for state in states]
+    save_animation(frames, files["animation"])
+    return files
+
+
+def _project(env: gym.vector.VectorEnv, actions: np.ndarray) -> np.ndarray:
     """Waypoints in the picture of the scene: (H, 2) pixels."""
     try:
         return env.call("world_to_pixels", actions)[0]
@@ -179,31 +250,42 @@ def _project(env: gym.vector.VectorEnv, actions: np.ndarray, scene: np.ndarray) 
         raise ValueError("this environment has no world_to_pixels(points): its plans cannot be drawn") from error
 
 
-def _execute(env: gym.vector.VectorEnv, actions: np.ndarray) -> tuple[float, bool]:
-    """Step through a plan; the score and the success at its end."""
+def _execute(env: gym.vector.VectorEnv, actions: np.ndarray, render: bool) -> tuple[float, bool, list[np.ndarray]]:
+    """Step through a plan: the score and the success at its end, and the scene after each waypoint.
+
+    There is no picture of the scene after an episode's last step: vector environments have reset by then.
+    """
+    frames: list[np.ndarray] = []
     for action in actions:
         _, reward, terminated, truncated, info = env.step(action[None])
         if terminated[0] or truncated[0]:
             final = info.get("final_info", info)
-            return float(reward[0]), bool(final["is_success"][0])
-    return float(reward[0]), bool(info["is_success"][0])
+            return float(reward[0]), bool(final["is_success"][0]), frames
+        if render:
+            frames.append(env.call("render")[0])
+    return float(reward[0]), bool(info["is_success"][0]), frames
+
+
+def _outcome(score: float, is_success: bool) -> str:
+    return f"executed: score {score:.2f}, {'success' if is_success else 'failure'}"
 
 
 def print_plan(result: Result) -> None:
-    """The plan in words, six to a line, and where the pictures are."""
-    symbols = result.symbols
-    print("plan:")
-    for start in range(0, len(symbols), WORDS_PER_ROW):
-        print("   ", " ".join(symbols[start : start + WORDS_PER_ROW]))
-    if not symbols:
-        print("    (no symbols)")
-    print(f"executed: score {result.score:.2f}, {'success' if result.is_success else 'failure'}")
-    print(f"picture: {result.picture}\nanimation: {result.animation}")
+    """The plan in words, what is wrong with it, what became of it, and where the files are."""
+    print("plan:\n" + indent(result.text, "    "))
+    if result.complaints is not None:
+        print("checked: " + ("valid" if not result.complaints else "; ".join(result.complaints)))
+    print(_outcome(result.score, result.is_success))
+    for name, path in result.files.items():
+        print(f"{name}: {path}")
 
 
 @parser.wrap()
 def _main(config: PlanConfig) -> None:
-    print_plan(make_plan(config))
+    if config.explain is None:
+        print_plan(make_plan(config))
+    else:
+        print(explain(config))
 
 
 def main() -> None:

@@ -1,0 +1,308 @@
+"""What planners do with a part of the plan given, and with a choice among several plans.
+
+    python -m benchmarks.conditioning adherence --checkpoints HDP JOINT SEPARATE
+    python -m benchmarks.conditioning valid_plan --checkpoints TWO_BLOCKS THREE_BLOCKS FOUR_BLOCKS
+    python -m benchmarks.conditioning candidates --checkpoints THREE_BLOCKS FOUR_BLOCKS
+
+Checkpoints are `pretrained_model` folders; each plans for the task that its training configuration names, from the same
+starts. `adherence` takes planners of one task: BlockSorting2D, in which the prompt says which block is moved first, or
+XArmToolUse, in which it says that red is stacked last (the paper's "conditional plan coherence"). Each writes
+`benchmarks/results/<command>_<task>.json`.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies import get_policy_class, make_pre_post_processors
+
+import lerobot_policy_hdp  # noqa: F401 (registers the policies and the tasks)
+from dataset_tools.demonstration import expert_generator
+from dataset_tools.experts import EXPERTS
+from gym_hdp_tasks.block_sorting_2d import SLOT_HALF_SIZE, block_name
+from gym_hdp_tasks.open_loop import execute_plans
+from lerobot_hdp import PlanPrompt
+from lerobot_hdp.candidates import best_candidates
+
+from .block_sorting_2d import RESULTS, wilson_interval
+from .machine import describe_run
+
+FIRST_SEED = 0
+"""Demonstrations were recorded from seeds of 32 random bits."""
+CANDIDATES = (1, 2, 4, 8)
+BATCH = 50
+"""Plans that are made at once."""
+
+Outcome = dict[str, Any]
+"""`is_success`, and what else is known of an executed plan."""
+
+
+@dataclass
+class Subject:
+    """A planner, and the starts that it plans for.
+
+    Attributes:
+        path: of its checkpoint.
+        policy, postprocessor: the planner.
+        gym_id, parameters: what makes its task.
+        seeds: of the starts.
+        observations: as the environment gives them.
+        inputs: the same, preprocessed.
+    """
+
+    path: Path
+    policy: Any
+    postprocessor: Any
+    gym_id: str
+    parameters: dict[str, Any]
+    seeds: range
+    observations: list[dict[str, np.ndarray]]
+    inputs: dict[str, torch.Tensor]
+
+    def make_env(self) -> gym.Env:
+        return gym.make(self.gym_id, disable_env_checker=True, **self.parameters)
+
+    def facts(self) -> dict[str, Any]:
+        """What a results file says about it."""
+        train = json.loads((self.path / "train_config.json").read_text())
+        steps = self.policy.config.num_inference_steps or self.policy.config.num_train_timesteps
+        return {
+            "planner": self.policy.config.type,
+            "task": self.gym_id.removeprefix("hdp/"),
+            "parameters": self.parameters,
+            "train_steps": train["steps"],
+            "train_seed": train["seed"],
+            "network_calls_per_plan": steps,
+            "starts": len(self.seeds),
+        }
+
+
+def load(path: Path, starts: int, num_inference_steps: int | None, gym_id: str | None = None) -> Subject:
+    """Load a checkpoint and reset its task (or another one) to the first seeds."""
+    config = PreTrainedConfig.from_pretrained(path)
+    policy = get_policy_class(config.type).from_pretrained(path)
+    if num_inference_steps:
+        policy.config.num_inference_steps = num_inference_steps
+    device = {"device_processor": {"device": policy.config.device}}
+    preprocessor, postprocessor = make_pre_post_processors(policy.config, path, preprocessor_overrides=device)
+    task = TrainPipelineConfig.from_pretrained(path).env.planning_task
+    gym_id = gym_id or task.gym_id
+    env = gym.make(gym_id, disable_env_checker=True, **task.parameters)
+    seeds = range(FIRST_SEED, FIRST_SEED + starts)
+    observations = [env.reset(seed=seed)[0] for seed in seeds]
+    names = {"observation.state": "agent_pos", "observation.environment_state": "environment_state"}
+    stacked = {key: torch.tensor(np.stack([o[name] for o in observations])) for key, name in names.items()}
+    inputs = {key: value for key, value in preprocessor(stacked).items() if key in names}
+    return Subject(path, policy, postprocessor, gym_id, task.parameters, seeds, observations, inputs)
+
+
+def make_plans(subject: Subject, prompts: Sequence[str] | torch.Tensor | None = None) -> np.ndarray:
+    """A plan for each start, with its prompt, if any: (starts, horizon, D) in the task's units.
+
+    Args:
+        subject: the planner and the starts.
+        prompts: one for each start, as words or as token ids (starts, H_d).
+    """
+    torch.manual_seed(0)
+    motions = []
+    for first in range(0, len(subject.seeds), BATCH):
+        part = slice(first, first + BATCH)
+        prompt = None if prompts is None else prompts[part]
+        if isinstance(prompt, torch.Tensor):
+            prompt = PlanPrompt(token_ids=prompt.to(subject.policy.config.device))
+        inputs = {key: value[part] for key, value in subject.inputs.items()}
+        motions.append(subject.postprocessor(subject.policy.plan(inputs, prompt).actions))
+    return torch.cat(motions).numpy()
+
+
+def execute(subject: Subject, motions: np.ndarray, seeds: Sequence[int]) -> list[Outcome]:
+    """Carry plans out; in the plane, say which block the gripper took first."""
+    if "XArm" in subject.gym_id:
+        return execute_plans(subject.gym_id, seeds, motions, **subject.parameters)
+    env, outcomes = subject.make_env(), []
+    for seed, motion in zip(seeds, motions, strict=True):
+        env.reset(seed=seed)
+        first_block = None
+        for action in motion:
+            *_, info = env.step(action)
+            if first_block is None and env.unwrapped.held is not None:
+                first_block = block_name(env.unwrapped.held)
+        outcomes.append({**info, "first_block": first_block})
+    return outcomes
+
+
+def rate(hits: Sequence[bool]) -> dict[str, Any]:
+    """How often, with its 95 % interval (Wilson)."""
+    hits = [bool(hit) for hit in hits]
+    if not hits:
+        return {"rate": None, "of": 0}
+    return {"rate": round(np.mean(hits), 4), "interval_95": wilson_interval(sum(hits), len(hits)), "of": len(hits)}
+
+
+def adherence(checkpoints: Sequence[Path], starts: int, num_inference_steps: int | None) -> list[dict]:
+    """Of the plans that succeed otherwise, how many do what the prompt asks for, with the prompt and without."""
+    results = []
+    for path in checkpoints:
+        trained_on = TrainPipelineConfig.from_pretrained(path).env.planning_task.gym_id
+        tool_use = trained_on == "hdp/XArmToolUse-v0"
+        subject = load(path, starts, num_inference_steps, "hdp/XArmToolUseRedOnTop-v0" if tool_use else None)
+        if tool_use:
+            prompts: Any = torch.tensor(np.stack([o["symbolic_plan"] for o in subject.observations]))
+            asked, done, otherwise_good = ["RED"] * starts, "top_block", "all_stacked"
+        else:
+            asked = _movable_blocks(subject)
+            prompts, done, otherwise_good = [f"PICK {block}" for block in asked], "first_block", "is_success"
+        result = subject.facts()
+        for name, given in (("with_prompt", prompts), ("without_prompt", None)):
+            outcomes = execute(subject, make_plans(subject, given), subject.seeds)
+            pairs = [(o[done] == block) for o, block in zip(outcomes, asked, strict=True) if o[otherwise_good]]
+            result[name] = {"adherence": rate(pairs), otherwise_good: rate([o[otherwise_good] for o in outcomes])}
+        print(json.dumps(result), flush=True)
+        results.append(result)
+    return results
+
+
+def _movable_blocks(subject: Subject) -> list[str]:
+    """For each start a block that a demonstration might move first: any that is not in its own slot."""
+    rng, env, asked = np.random.default_rng(0), subject.make_env(), []
+    for seed in subject.seeds:
+        env.reset(seed=seed)
+        sim = env.unwrapped
+        home = np.abs(sim.blocks - sim.slots[: sim.n_blocks]).max(axis=1) <= SLOT_HALF_SIZE
+        asked.append(block_name(int(rng.choice(np.flatnonzero(~home)))))
+    return asked
+
+
+def valid_plan(checkpoints: Sequence[Path], starts: int, num_inference_steps: int | None) -> list[dict]:
+    """Success with the expert's symbolic plan given, and with none."""
+    results = []
+    for path in checkpoints:
+        subject = load(path, starts, num_inference_steps)
+        env, plans = subject.make_env(), []
+        for seed in subject.seeds:
+            env.reset(seed=seed)
+            symbols = EXPERTS[subject.gym_id](env, expert_generator(seed)).remaining_symbols(0)
+            plans.append(subject.policy.vocabulary.encode(symbols, subject.policy.config.symbolic_horizon))
+        result = subject.facts()
+        for name, given in (("valid_plan_given", torch.stack(plans)), ("nothing_given", None)):
+            outcomes = execute(subject, make_plans(subject, given), subject.seeds)
+            result[name] = {
+                "success": rate([o["is_success"] for o in outcomes]),
+                "mean_score": round(np.mean([o["score"] for o in outcomes]), 4),
+            }
+        print(json.dumps(result), flush=True)
+        results.append(result)
+    return results
+
+
+@dataclass
+class Candidates:
+    """Several plans for each start: (starts, k) arrays, and the seconds that one of them took.
+
+    Attributes:
+        success: whether the executed plan succeeded.
+        scores: the model's score of the plan.
+        complaints: how many the task's checker has about its symbols.
+        plan_s, score_s: seconds to make and to score a plan.
+    """
+
+    success: np.ndarray
+    scores: torch.Tensor
+    complaints: np.ndarray
+    plan_s: float
+    score_s: float
+
+    def best_of(self, k: int, checked: bool) -> dict[str, Any]:
+        """Success of the best of k. All groups of k count, so that a small k rests on as many plans as a large one."""
+        starts, most = self.success.shape
+        hits = []
+        for group in (slice(first, first + k) for first in range(0, most, k)):
+            counts = self.complaints[:, group].tolist() if checked else None
+            chosen = best_candidates(self.scores[:, group], counts).numpy()
+            hits.append(self.success[:, group][np.arange(starts), chosen])
+        mean = float(np.mean(hits))
+        # Groups of one start are not independent: as many trials as there are starts.
+        return {"rate": round(mean, 4), "interval_95": wilson_interval(round(mean * starts), starts)}
+
+
+def draw_candidates(subject: Subject, number: int) -> Candidates:
+    """Make, score, check and execute a number of plans for each start."""
+    task = subject.make_env().unwrapped.planning_task
+    success, scores, complaints = [], [], []
+    plan_s = score_s = 0.0
+    torch.manual_seed(0)
+    for i, seed in enumerate(subject.seeds):
+        inputs = {key: value[i : i + 1].expand(number, -1) for key, value in subject.inputs.items()}
+        begin = time.perf_counter()
+        plan = subject.policy.plan(inputs, num_candidates=1)
+        made = time.perf_counter()
+        scores.append(subject.policy.score(inputs, plan).cpu())
+        score_s += time.perf_counter() - made
+        plan_s += made - begin
+        complaints.append([len(task.check_plan(plan.symbols(j), subject.observations[i])) for j in range(number)])
+        outcomes = execute(subject, subject.postprocessor(plan.actions).numpy(), [seed] * number)
+        success.append([outcome["is_success"] for outcome in outcomes])
+    plans = number * len(subject.seeds)
+    return Candidates(np.array(success), torch.stack(scores), np.array(complaints), plan_s / plans, score_s / plans)
+
+
+def candidates(checkpoints: Sequence[Path], starts: int, num_inference_steps: int | None) -> list[dict]:
+    """Success of the best of k plans, by the model's own likelihood, and by the task's checker before it."""
+    results = []
+    for path in checkpoints:
+        subject = load(path, starts, num_inference_steps)
+        drawn = draw_candidates(subject, max(CANDIDATES))
+        best_of = [
+            {
+                "k": k,
+                "by_likelihood": drawn.best_of(k, checked=False),
+                "by_checker": drawn.best_of(k, checked=True),
+                "seconds_per_plan": round(k * (drawn.plan_s + (drawn.score_s if k > 1 else 0.0)), 4),
+            }
+            for k in CANDIDATES
+        ]
+        result = {
+            **subject.facts(),
+            "valid_symbolic_plans": round(float((drawn.complaints == 0).mean()), 4),
+            "starts_that_any_candidate_solves": round(float(drawn.success.any(axis=1).mean()), 4),
+            "best_of": best_of,
+        }
+        print(json.dumps(result), flush=True)
+        results.append(result)
+    return results
+
+
+COMMANDS: dict[str, Callable[..., list[dict]]] = {
+    "adherence": adherence,
+    "valid_plan": valid_plan,
+    "candidates": candidates,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("command", choices=COMMANDS)
+    parser.add_argument("--checkpoints", nargs="+", type=Path, required=True)
+    parser.add_argument("--starts", type=int, default=200)
+    parser.add_argument("--num_inference_steps", type=int, help="network calls for a plan; else as in the checkpoint")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    run_facts = describe_run()
+    results = COMMANDS[options.command](options.checkpoints, options.starts, options.num_inference_steps)
+    task = results[0]["task"].removesuffix("-v0")
+    path = options.results / f"{options.command}_{task}.json"
+    path.write_text(json.dumps({"run": run_facts, "results": results}, indent=2) + "\n")
+    print(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main()

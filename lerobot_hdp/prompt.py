@@ -1,0 +1,184 @@
+"""The language of prompts: a part of a plan in words. docs/conditioning.md is its manual.
+
+    PICK A           the plan begins so; what follows is open
+    PICK _ S1        `_` is one position that the planner decides
+    ... STACK red    `...` is any number of them, also none: the plan ends with STACK red
+    PICK A ... S3    it begins with PICK A and ends with S3
+    ... AUX ...      AUX is somewhere
+    7:PICK B         PICK is at position 7 and B at 8, counted from 1
+    -2:STACK         STACK is the last symbol but one
+    STACK red PAD    PAD ends the plan
+    PICK A from S1   `from` and `to` are only there to be read
+
+A prompt with `...` before a word does not say where in the plan that word is: where the plan ends is the planner's
+choice, too. So a prompt is a list of placements, and the planner draws one (`choose_placement`).
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+import torch
+from torch import Generator, Tensor
+
+from .vocabulary import FREE, Vocabulary
+
+FREE_WORD = "_"
+ANY_NUMBER = "..."
+FILLER_WORDS = ("FROM", "TO")
+"""Ignored, unless they are symbols."""
+MAX_PLACEMENTS = 10_000
+"""More ways to place a prompt than this are refused; each further part without a place multiplies them."""
+
+
+@dataclass
+class Part:
+    """Words of a prompt that follow each other without a gap.
+
+    Attributes:
+        ids: a token id, or FREE, for each word.
+        start: the first word's position, from 0; negative: from the end of the plan; None: anywhere after the part
+            before.
+    """
+
+    ids: list[int]
+    start: int | None
+
+
+def encode_prompt(prompt: str, vocabulary: Vocabulary, length: int) -> Tensor:
+    """All ways to place a prompt in a plan of up to `length` symbols: (C, length) int64, C >= 1.
+
+    Each is a row of token ids, FREE where the planner decides, PAD from the end of the plan on where the prompt says
+    how the plan ends.
+
+    Raises:
+        ValueError: an unknown symbol, an impossible position, or a prompt that does not fit.
+
+    Example:
+        >>> encode_prompt("PICK _ S1", Vocabulary(["PAD", "A", "PICK", "S1"]), length=4)
+        tensor([[ 2, -1,  3, -1]])
+        >>> encode_prompt("... S1", Vocabulary(["PAD", "A", "PICK", "S1"]), length=3)
+        tensor([[ 3,  0,  0],
+                [-1,  3,  0],
+                [-1, -1,  3]])
+    """
+    parts = _parse(prompt, vocabulary)
+    rows = list(islice(_placements(parts, length, vocabulary.pad_id), MAX_PLACEMENTS + 1))
+    if not rows:
+        raise ValueError(
+            f"the prompt '{prompt}' does not fit into a plan of {length} symbols: it is too long, names a position "
+            "outside of it, or its parts overlap or are out of order"
+        )
+    if len(rows) > MAX_PLACEMENTS:
+        raise ValueError(
+            f"the prompt '{prompt}' can be placed in too many ways: give positions by number, as in 7:PICK"
+        )
+    return torch.tensor(list(dict.fromkeys(rows)))
+
+
+def shared_tokens(placements: Tensor) -> Tensor:
+    """What all placements (C, H) agree on, FREE elsewhere: (H,)."""
+    agreed = (placements == placements[0]).all(dim=0)
+    return torch.where(agreed, placements[0], FREE)
+
+
+def choose_placement(placements: Tensor, logits: Tensor, generator: Generator | None = None) -> Tensor:
+    """Draw a placement by its probability: (C, H) -> (H,).
+
+    The probability is the product of those of the given tokens, those that all placements share aside, up to the
+    first PAD, which decides where the plan ends.
+
+    Args:
+        placements: as `encode_prompt` makes them.
+        logits: (H, m) scores of the symbols, with the shared tokens given.
+        generator: source of randomness; None: PyTorch's global one.
+    """
+    is_pad = placements == 0
+    after_first_pad = is_pad & is_pad.roll(1, dims=1)
+    after_first_pad[:, 0] = False
+    counted = (placements != FREE) & (shared_tokens(placements) == FREE) & ~after_first_pad
+    log_probabilities = logits.float().log_softmax(dim=-1)[torch.arange(len(logits)), placements.clamp(min=0)]
+    scores = torch.where(counted, log_probabilities, 0.0).sum(dim=1)
+    return placements[torch.multinomial(scores.softmax(dim=0), 1, generator=generator).item()]
+
+
+def _parse(prompt: str, vocabulary: Vocabulary) -> list[Part]:
+    """The parts of a prompt that give at least one symbol, in order."""
+    spaced = re.sub(r"\.\.\.|…", f" {ANY_NUMBER} ", prompt)
+    words = re.sub(r"(?<=\d)\s*:\s*", ":", spaced).split()
+    parts: list[Part] = []
+    start: int | None = 0  # of the next part
+    begins = True  # whether the next word begins a part
+    for place, word in enumerate(words, start=1):
+        if word == ANY_NUMBER:
+            start, begins = None, True
+            continue
+        numbered = re.fullmatch(r"([+-]?\d+):(.+)", word)
+        if numbered:
+            start, begins = _position(int(numbered[1]), word, place), True
+            word = numbered[2]
+        symbol = _token_id(word, place, vocabulary)
+        if symbol is None:
+            continue
+        if begins:
+            parts.append(Part([], start))
+            begins = False
+        parts[-1].ids.append(symbol)
+    if parts and parts[-1].start is None and not begins:
+        parts[-1].start = -len(parts[-1].ids)
+    return [part for part in parts if any(token != FREE for token in part.ids)]
+
+
+def _position(number: int, word: str, place: int) -> int:
+    """A position as it is written, 1, 2, ... or ..., -2, -1, as an index."""
+    if number == 0:
+        raise ValueError(f"'{word}' (word {place} of the prompt): positions count from 1, or from the end from -1")
+    return number - 1 if number > 0 else number
+
+
+def _token_id(word: str, place: int, vocabulary: Vocabulary) -> int | None:
+    """The token id of a word, FREE, or None for a filler word."""
+    if word == FREE_WORD:
+        return FREE
+    if word in vocabulary:
+        return vocabulary.token_id(word)
+    if word.upper() in FILLER_WORDS:
+        return None
+    raise ValueError(
+        f"unknown symbol '{word}' (word {place} of the prompt); the symbols are {' '.join(vocabulary.symbols)}, "
+        f"'{FREE_WORD}' leaves one open and '{ANY_NUMBER}' any number"
+    )
+
+
+def _placements(parts: Sequence[Part], length: int, pad_id: int) -> Iterator[tuple[int, ...]]:
+    """Rows of token ids, one for each way to place the parts; some may come twice."""
+    says_the_end = any(part.start is not None and part.start < 0 for part in parts)
+    for plan_length in range(1, length + 1) if says_the_end else (length,):
+        for starts in _starts(parts, 0, plan_length):
+            row = [FREE] * plan_length + [pad_id] * (length - plan_length)
+            for part, start in zip(parts, starts, strict=True):
+                row[start : start + len(part.ids)] = part.ids
+            if pad_id in row:
+                end = row.index(pad_id)
+                if any(token not in (FREE, pad_id) for token in row[end:]):
+                    continue
+                row[end:] = [pad_id] * (length - end)
+            yield tuple(row)
+
+
+def _starts(parts: Sequence[Part], earliest: int, plan_length: int) -> Iterator[tuple[int, ...]]:
+    """Where each part begins, without overlaps, in their order."""
+    if not parts:
+        yield ()
+        return
+    part, size = parts[0], len(parts[0].ids)
+    if part.start is None:
+        choices = range(earliest, plan_length - size + 1)
+    else:
+        start = part.start if part.start >= 0 else plan_length + part.start
+        choices = range(start, start + 1)
+    for start in choices:
+        if earliest <= start <= plan_length - size:
+            for others in _starts(parts[1:], start + size, plan_length):
+                yield (start, *others)
