@@ -28,10 +28,10 @@ quickstart: setup
 	test -e $(OUT)/dataset || $(BIN)/hdp-record $(TASK) --resume=true --num_workers=2 \
 		--dataset.repo_id=local/block_sorting_2d_2_blocks --dataset.root=$(OUT)/dataset --dataset.num_episodes=200
 	@if [ -e $(OUT)/train/checkpoints/last ]; then \
-		$(BIN)/lerobot-train --resume=true --config_path=$(OUT)/train/checkpoints/last/pretrained_model/train_config.json; \
+		$(BIN)/hdp-train --resume=true --config_path=$(OUT)/train/checkpoints/last/pretrained_model/train_config.json; \
 	else \
 		rm -rf $(OUT)/train; \
-		$(BIN)/lerobot-train --config_path=$(CONFIG) --dataset.root=$(OUT)/dataset --output_dir=$(OUT)/train; \
+		$(BIN)/hdp-train --config_path=$(CONFIG) --dataset.root=$(OUT)/dataset --output_dir=$(OUT)/train; \
 	fi
 	$(BIN)/lerobot-eval --policy.path=$(OUT)/train/checkpoints/last/pretrained_model --env.type=hdp $(TASK) --eval.n_episodes=50 \
 		--eval.batch_size=50 --eval.use_async_envs=false --output_dir=$(OUT)/eval

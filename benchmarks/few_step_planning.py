@@ -3,7 +3,8 @@
     python -m benchmarks.few_step_planning outputs/train/sorting/checkpoints/last/pretrained_model
 
 Every sampler plans for the same fresh starts of the task that the checkpoint was trained for, in LeRobot's own
-evaluation. Writes `benchmarks/results/few_step_planning/<task>.json`, and all results there to `docs/few_steps.md`.
+evaluation. Writes `benchmarks/results/few_step_planning/<planner>_<task>.json`, and all results there to
+`docs/few_steps.md`.
 """
 
 import argparse
@@ -76,7 +77,8 @@ def write_page() -> None:
         result = file["result"]
         cells = {(point["sampler"], point["calls"]): point for point in result["curve"]}
         samplers = [sampler for sampler in SAMPLERS if any(key[0] == sampler for key in cells)]
-        page += f"## {result['task']}\n\n{result['episodes']} starts, one checkpoint of {result['train_steps']} steps; "
+        page += f"## `{result['planner']}`, {result['task']}\n\n"
+        page += f"{result['episodes']} starts, one checkpoint of {result['train_steps']} steps; "
         page += f"`{file['run']['command']}`.\n\n"
         page += f"| calls | {' | '.join(f'`{sampler}`' for sampler in samplers)} |\n|---|{'---|' * len(samplers)}\n"
         for calls in sorted({key[1] for key in cells}):
@@ -108,9 +110,16 @@ def main() -> None:
     for sampler, calls in product(options.samplers, options.calls):
         curve.append(evaluate(options.checkpoint, env, sampler, calls, options.episodes))
         print(curve[-1], flush=True)
-    result = {"task": task, "episodes": options.episodes, "train_steps": train_config.steps, "curve": curve}
+    planner = train_config.policy.type
+    result = {
+        "planner": planner,
+        "task": task,
+        "episodes": options.episodes,
+        "train_steps": train_config.steps,
+        "curve": curve,
+    }
     RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / f"{task}.json").write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
+    (RESULTS / f"{planner}_{task}.json").write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
     write_page()
 
 
