@@ -33,8 +33,8 @@ from gym_hdp_tasks.open_loop import execute_plans
 from lerobot_hdp import PlanPrompt
 from lerobot_hdp.candidates import best_candidates
 
-from .block_sorting_2d import RESULTS, wilson_interval
 from .machine import describe_run
+from .train_and_evaluate import RESULTS, wilson_interval
 
 FIRST_SEED = 0
 """Demonstrations were recorded from seeds of 32 random bits."""

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from .block_sorting_2d import RESULTS
+from .train_and_evaluate import RESULTS
 
 PAGE = Path(__file__).parents[1] / "docs" / "conditioning.md"
 HEADING = "## Measured\n"
