@@ -40,7 +40,7 @@ def make_planner(policy_type: str, env: HDPEnv, **options) -> HDPPolicy:
     """A planner for a task, with random weights and without a dataset."""
     columns = dataset_features(RecordConfig(RecordDatasetConfig("local/none"), env))
     features = dataset_to_policy_features(columns)
-    config = PreTrainedConfig.get_choice_class(policy_type)(horizon=env.planning_task.horizon, **options)
+    config = PreTrainedConfig.get_choice_class(policy_type)(**{"horizon": env.planning_task.horizon, **options})
     config.input_features = {k: f for k, f in features.items() if f.type in (FeatureType.STATE, FeatureType.ENV)}
     config.output_features = {k: f for k, f in features.items() if f.type is FeatureType.ACTION}
     config.set_dataset_feature_metadata(columns)
