@@ -22,10 +22,10 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lerobot.common.train_utils import load_training_state, save_training_state
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
@@ -34,10 +34,12 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from lerobot.utils.random_utils import set_seed
 from torch import Tensor
+from torch.utils.data import DataLoader
 
 import lerobot_policy_hdp  # noqa: F401 (registers the planners)
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
 from gym_hdp_tasks.env_config import HDPEnv
+from lerobot_hdp.in_memory_dataset import InMemoryDataset
 from lerobot_hdp.modeling_hdp import HDPPolicy
 
 from .machine import describe_run
@@ -128,23 +130,29 @@ def dataset_root(cell: Cell, protocol: Protocol) -> Path:
     return root
 
 
-def load_samples(root: Path, config: PreTrainedConfig) -> tuple[dict[str, Any], LeRobotDatasetMetadata]:
-    """Every training sample in one batch, as LeRobot gives it: that of each episode's first frame."""
+def load_dataset(root: Path, config: PreTrainedConfig) -> InMemoryDataset:
+    """The dataset in memory, with the windows that a policy trains on."""
     meta = LeRobotDatasetMetadata(f"local/{root.name}", root=root)
     windows = resolve_delta_timestamps(config, meta)
-    dataset = LeRobotDataset(meta.repo_id, root=root, delta_timestamps=windows, video_backend="pyav")
-    first_frames = meta.episodes["dataset_from_index"]
-    return torch.utils.data.default_collate([dataset[int(frame)] for frame in first_frames]), meta
+    return InMemoryDataset(LeRobotDataset(meta.repo_id, root=root, delta_timestamps=windows, video_backend="pyav"))
 
 
-def batches(samples: dict[str, Tensor], batch_size: int, seed: int, start: int) -> Iterator[dict[str, Tensor]]:
-    """Batches from the `start`-th on, each epoch in an order that follows from the seed."""
-    size = len(next(iter(samples.values())))
-    for number in range(start * batch_size, 2**62, batch_size):
-        epoch, offset = divmod(number, size)
-        order = np.random.default_rng([seed, epoch]).permutation(size)
-        rows = torch.from_numpy(order[offset : offset + batch_size])
-        yield {key: column[rows] for key, column in samples.items()}
+def batches(
+    dataset: LeRobotDataset, config: PreTrainedConfig, batch_size: int, seed: int, step: int
+) -> Iterator[dict[str, Tensor]]:
+    """The batches of `lerobot-train` from a step on."""
+    episodes = dataset.meta.episodes
+    sampler = EpisodeAwareSampler(
+        episodes["dataset_from_index"],
+        episodes["dataset_to_index"],
+        drop_n_last_frames=config.drop_n_last_frames,
+        shuffle=True,
+        seed=seed,
+    )
+    sampler.load_state_dict(compute_sampler_state(step, len(sampler), batch_size, num_processes=1))
+    loader = DataLoader(dataset, batch_size, sampler=sampler)
+    while True:
+        yield from loader
 
 
 class Training:
@@ -154,11 +162,10 @@ class Training:
         set_seed(cell.seed)
         self.cell, self.protocol = cell, protocol
         config = cell.policy_config(protocol)
-        samples, meta = load_samples(dataset_root(cell, protocol), config)
+        self.dataset = load_dataset(dataset_root(cell, protocol), config)
+        meta = self.dataset.meta
         self.policy: HDPPolicy = make_policy(config, ds_meta=meta)
         self.preprocessor, self.postprocessor = make_pre_post_processors(config, dataset_stats=meta.stats)
-        prepared = self.preprocessor(samples)
-        self.samples = {key: value for key, value in prepared.items() if isinstance(value, Tensor) and value.ndim}
         self.step, self.seconds, self.curve = 0, 0.0, []
         if cell.checkpoint.exists():
             self.policy = get_policy_class(cell.planner).from_pretrained(cell.checkpoint)
@@ -175,10 +182,10 @@ class Training:
         """Take optimiser steps, as `lerobot-train` does."""
         start, config = time.perf_counter(), self.policy.config
         self.policy.train()
-        data = batches(self.samples, self.protocol.batch_size, self.cell.seed, self.step)
+        data = batches(self.dataset, config, self.protocol.batch_size, self.cell.seed, self.step)
         for batch, _ in zip(data, range(steps), strict=False):
             with torch.autocast("cpu", torch.bfloat16, enabled=config.dtype == "bfloat16"):
-                loss, _ = self.policy.forward(batch)
+                loss, _ = self.policy.forward(self.preprocessor(batch))
             loss.backward()
             torch.nn.utils.clip_grad_norm_(self.policy.parameters(), config.optimizer_grad_clip_norm)
             self.optimizer.step()
