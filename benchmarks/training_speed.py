@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from accelerate import Accelerator
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_train import update_policy
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
@@ -33,6 +33,7 @@ from lerobot_hdp.in_memory_dataset import InMemoryDataset
 from .machine import describe_run
 
 RESULTS = Path(__file__).parent / "results" / "training_speed.json"
+PAGE = Path(__file__).parents[1] / "docs" / "training_speed.md"
 
 
 def timed(function: Callable[[], Any]) -> float:
@@ -130,6 +131,28 @@ def end_to_end(flags: list[str], steps: int, rounds: int) -> dict[str, Any]:
     return {"samples_per_s": rates, "ratio": [round(ratio, 3) for ratio in ratios]}
 
 
+def write_page() -> None:
+    """The result in words."""
+    file = json.loads(RESULTS.read_text())
+    run, result = file["run"], file["result"]
+    data, step, commands = result["data_path"], result["step"], result["end_to_end"]
+    rates = {name: statistics.median(found) for name, found in commands["samples_per_s"].items()}
+    PAGE.write_text(
+        "# `hdp-train` beside `lerobot-train`\n\n"
+        f"`hdp` with {result['num_layers']} layers of width {result['width']} in bfloat16, "
+        f"horizon {result['horizon']}, batches of {result['batch_size']}, dataset `{result['dataset']}`, on {run['cores']} cores ({run['cpu']}, "
+        f"LeRobot {run['packages']['lerobot']}, PyTorch {run['packages']['torch']}). Medians; quartiles are in "
+        f"[the results file](../benchmarks/results/{RESULTS.name}).\n\n"
+        "| | `lerobot-train` | `hdp-train` | ratio |\n|---|---|---|---|\n"
+        f"| reading alone, one core, samples/s | {data['samples_per_s_lerobot'][1]:.0f} | "
+        f"{data['samples_per_s_in_memory'][1]:.0f} | {data['ratio'][1]:.0f} |\n"
+        f"| training, {result['num_workers']} workers for `lerobot-train`, samples/s | {rates['lerobot-train']:.0f} | "
+        f"{rates['hdp-train']:.0f} | {statistics.median(commands['ratio']):.2f} |\n\n"
+        f"A whole step of `hdp-train` takes {step['ratio_of_medians']:.3f} times as long as the bare forward pass, "
+        f"backward pass and optimiser on a batch at hand, on one core.\n\n`{run['command']}`\n"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, default=Path("outputs/datasets/xarm_sorting"))
@@ -144,8 +167,9 @@ def main() -> None:
 
     sizes = {name: getattr(options, name) for name in ("horizon", "num_layers", "width")}
     config = PreTrainedConfig.get_choice_class("hdp")(**sizes, dtype="bfloat16", device="cpu", push_to_hub=False)
-    windows = {"action": [i / 10 for i in range(options.horizon)]}
-    dataset = LeRobotDataset(f"local/{options.root.name}", root=options.root, delta_timestamps=windows)
+    meta = LeRobotDatasetMetadata(f"local/{options.root.name}", root=options.root)
+    windows = {"action": [i / meta.fps for i in range(options.horizon)]}
+    dataset = LeRobotDataset(meta.repo_id, root=options.root, delta_timestamps=windows)
     flags = [
         "--policy.type=hdp",
         *(f"--policy.{name}={value}" for name, value in sizes.items()),
@@ -165,7 +189,8 @@ def main() -> None:
     result["step"] = step_overhead(dataset, config, options.batch_size, options.rounds)
     result["end_to_end"] = end_to_end(flags, options.steps, max(options.rounds // 3, 1))
     RESULTS.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
-    print(RESULTS.read_text())
+    write_page()
+    print(PAGE.read_text())
 
 
 if __name__ == "__main__":
