@@ -54,7 +54,9 @@ def evaluate(checkpoint: Path, env: HDPEnv, sampler: str, calls: int, episodes: 
         environments,
         policy,
         *make_env_pre_post_processors(env, config),
-        *make_pre_post_processors(config, str(checkpoint)),
+        *make_pre_post_processors(
+            config, str(checkpoint), preprocessor_overrides={"device_processor": {"device": config.device}}
+        ),
         n_episodes=episodes,
         start_seed=FIRST_SEED,
     )["overall"]

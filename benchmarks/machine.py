@@ -5,6 +5,9 @@ import platform
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
+
+import torch
 
 
 def describe_run() -> dict[str, object]:
@@ -14,6 +17,7 @@ def describe_run() -> dict[str, object]:
         "git_commit": _git("rev-parse", "--short", "HEAD") + ("+changes" if _git("status", "--porcelain") else ""),
         "cpu": _cpu_name(),
         "cores": os.cpu_count(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "python": platform.python_version(),
         "packages": {name: version(name) for name in ("lerobot", "torch", "gymnasium", "mujoco", "numpy")},
     }
@@ -29,6 +33,7 @@ def _git(*arguments: str) -> str:
 
 
 def _cpu_name() -> str:
-    with open("/proc/cpuinfo") as file:
-        names = [line.split(":")[1].strip() for line in file if line.startswith("model name")]
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor()

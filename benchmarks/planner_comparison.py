@@ -223,7 +223,7 @@ class Training:
 
     def save(self) -> None:
         """Write a checkpoint in place of the last one."""
-        new = self.cell.checkpoint.with_suffix(".new")
+        new = self.cell.checkpoint.with_name(self.cell.name + ".new")
         shutil.rmtree(new, ignore_errors=True)
         self.policy.save_pretrained(new)
         save_training_state(new, self.step, self.optimizer, self.scheduler)

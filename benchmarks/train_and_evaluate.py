@@ -62,7 +62,11 @@ def measure(config: Path, name: str, planner: str, episodes: int, seed: int, fla
         )
     output = OUTPUTS / f"{name}_{planner}_seed{seed}"
     checkpoint = output / "checkpoints" / "last" / "pretrained_model"
-    resumed = checkpoint.exists()
+    resumed, flags_file = checkpoint.exists(), output.with_suffix(".flags.json")
+    if resumed and json.loads(flags_file.read_text()) != flags:
+        raise ValueError(f"{output} was trained with other flags: delete it, or choose another --name")
+    flags_file.parent.mkdir(parents=True, exist_ok=True)
+    flags_file.write_text(json.dumps(flags))
     if resumed:
         train_flags = ["--resume=true", f"--config_path={checkpoint / 'train_config.json'}"]
     else:
@@ -87,6 +91,8 @@ def measure(config: Path, name: str, planner: str, episodes: int, seed: int, fla
         "seed": seed,
         "train_minutes": None if resumed else round(train_s / 60, 1),
         "steps": json.loads((checkpoint / "train_config.json").read_text())["steps"],
+        "demonstrations": json.loads((dataset / "meta" / "info.json").read_text())["total_episodes"],
+        "flags": flags,
         "episodes": episodes,
         "success_rate": successes / episodes,
         "success_rate_95": wilson_interval(successes, episodes),

@@ -140,8 +140,9 @@ def write_page() -> None:
     PAGE.write_text(
         "# `hdp-train` beside `lerobot-train`\n\n"
         f"`hdp` with {result['num_layers']} layers of width {result['width']} in bfloat16, "
-        f"horizon {result['horizon']}, batches of {result['batch_size']}, dataset `{result['dataset']}`, on {run['cores']} cores ({run['cpu']}, "
-        f"LeRobot {run['packages']['lerobot']}, PyTorch {run['packages']['torch']}). Medians; quartiles are in "
+        f"horizon {result['horizon']}, batches of {result['batch_size']}, dataset `{result['dataset']}`, "
+        f"on {run['cores']} cores ({run['cpu']}, LeRobot {run['packages']['lerobot']}, "
+        f"PyTorch {run['packages']['torch']}). Medians; quartiles are in "
         f"[the results file](../benchmarks/results/{RESULTS.name}).\n\n"
         "| | `lerobot-train` | `hdp-train` | ratio |\n|---|---|---|---|\n"
         f"| reading alone, one core, samples/s | {data['samples_per_s_lerobot'][1]:.0f} | "

@@ -39,6 +39,8 @@ def write_language_columns(root: Path, vocabulary: Sequence[str]) -> None:
     language_features = datasets.Features({key: features[key] for key in (LANGUAGE_PERSISTENT, LANGUAGE_EVENTS)})
     for path in sorted((root / "data").glob("*/*.parquet")):
         table = pq.read_table(path)
+        if LANGUAGE_PERSISTENT in table.column_names:
+            continue  # an interrupted call has written this one
         plans, timestamps = np.array(table[SYMBOLIC_PLAN].to_pylist()), table["timestamp"].to_numpy()
         episode_indices = table["episode_index"].to_numpy()
         starts = np.flatnonzero(np.diff(episode_indices, prepend=-1))

@@ -6,7 +6,7 @@
 
 Takes all flags of `hdp-record`; the dataset that comes out is the same. A shard is 25 episodes, each with a seed of its
 own, so that it does not matter which machine records it. When all are done, one more task merges them with LeRobot's
-`aggregate_datasets`. A failed or interrupted job goes on when the same command is given again. The dataset's folder
+`aggregate_datasets`. When a job has failed or was stopped, the same command goes on with it. The dataset's folder
 must be one that all machines see; the engine's logs are written beside it. Needs the extra `cluster`:
 `pip install 'lerobot_policy_hdp[cluster]'`.
 """
@@ -79,6 +79,8 @@ def record_on_cluster(config: ClusterRecordConfig) -> None:
             **kwargs,
         }
         workers = min(config.num_workers, tasks)
+        conda = os.environ.get("CONDA_PREFIX")
+        environment = {"condaenv": conda} if conda else {"venv_path": str(Path(sys.prefix) / "bin" / "activate")}
         if config.slurm.partition is None:
             return LocalPipelineExecutor(workers=workers, **common)
         return SlurmPipelineExecutor(
@@ -87,7 +89,7 @@ def record_on_cluster(config: ClusterRecordConfig) -> None:
             partition=config.slurm.partition,
             time=config.slurm.time,
             mem_per_cpu_gb=config.slurm.mem_per_cpu_gb,
-            venv_path=str(Path(sys.prefix) / "bin" / "activate"),
+            **environment,
             **common,
         )
 

@@ -1,8 +1,14 @@
 """Gymnasium tasks that need a long motion and a plan behind it. Importing this package registers their ids."""
 
+import os
+import sys
+
 import gymnasium as gym
 
 from .task import PAD, PlanningTask
+
+if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo, which reads this when it is imported, would look for a display
 
 __all__ = ["PAD", "PlanningTask"]
 

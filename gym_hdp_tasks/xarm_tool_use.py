@@ -75,7 +75,7 @@ def xarm_tool_use_task(robot: str = "primitive", gym_id: str = "hdp/XArmToolUse-
 
 
 def check_plan(symbols: Sequence[str], observation: Observation, top_block: str | None = None) -> list[str]:
-    """What is wrong with a plan: each block is dragged once, and after that stacked once.
+    """What is wrong with a plan: each block is dragged once; when the hook is laid down, each is stacked once.
 
     Args:
         symbols: the plan.
@@ -89,6 +89,8 @@ def check_plan(symbols: Sequence[str], observation: Observation, top_block: str 
             complaints.append(f"move {number}: {verb} {block} comes a second time")
         if verb == "STACK" and ("DRAG", block) not in before:
             complaints.append(f"move {number}: STACK {block} comes before DRAG {block}")
+        elif verb == "STACK" and any(later == "DRAG" for later, _ in moves[number:]):
+            complaints.append(f"move {number}: STACK {block} comes while the hook is still needed")
     complaints += [f"{block} is never stacked" for block in BLOCKS if ("STACK", block) not in moves]
     stacked = [block for verb, block in moves if verb == "STACK"]
     if top_block and stacked and stacked[-1] != top_block:

@@ -47,9 +47,10 @@ class InMemoryDataset(LeRobotDataset):
         if (reason := unsupported(dataset)) is not None:
             raise ValueError(f"{dataset.repo_id} cannot be held in memory: {reason}")
         self._columns, self._words = _read_columns(dataset)
-        self._columns |= {key: _decode_videos(dataset, key) for key in self.meta.video_keys}
-        episodes = self._columns["episode_index"]
-        _, inverse, lengths = episodes.unique_consecutive(return_inverse=True, return_counts=True)
+        episodes, inverse, lengths = self._columns["episode_index"].unique_consecutive(
+            return_inverse=True, return_counts=True
+        )
+        self._columns |= {key: _decode_videos(dataset, key, episodes.tolist()) for key in self.meta.video_keys}
         ends = lengths.cumsum(0)
         self._first, self._last = (ends - lengths)[inverse], (ends - 1)[inverse]
         self._offsets = {key: torch.tensor(deltas) for key, deltas in (self.reader.delta_indices or {}).items()}
@@ -117,22 +118,24 @@ def _read_columns(dataset: LeRobotDataset) -> tuple[dict[str, Tensor], dict[str,
         elif dataset.meta.features[key]["dtype"] == "string":
             words[key] = table[key][:]
         else:
-            values = np.stack(table.with_format("numpy")[:][key])
+            values = np.stack(table.select_columns(key).with_format("numpy")[:][key])
             kind = {"f": np.float32, "i": np.int64, "u": np.int64, "b": np.bool_}[values.dtype.kind]
             columns[key] = torch.from_numpy(values.astype(kind))
     return columns, words
 
 
-def _decode_videos(dataset: LeRobotDataset, key: str) -> Tensor:
-    """All frames of a camera: (N, C, H, W) uint8."""
-    episodes = range(dataset.meta.total_episodes) if dataset.episodes is None else dataset.episodes
-    frames = []
+def _decode_videos(dataset: LeRobotDataset, key: str, episodes: list[int]) -> Tensor:
+    """All frames of a camera, episode by episode: (N, C, H, W) uint8."""
+    height, width, channels = dataset.meta.features[key]["shape"]
+    frames = torch.empty(dataset.num_frames, channels, height, width, dtype=torch.uint8)
+    stop = 0
     for index in tqdm(episodes, desc=f"Decoding {key}", unit="episode"):
         episode = dataset.meta.episodes[index]
-        start = episode[f"videos/{key}/from_timestamp"]
-        timestamps = [start + i / dataset.fps for i in range(episode["length"])]
+        first = episode[f"videos/{key}/from_timestamp"]
+        timestamps = [first + i / dataset.fps for i in range(episode["length"])]
         path = dataset.root / dataset.meta.get_video_file_path(index, key)
-        frames.append(
-            decode_video_frames(path, timestamps, dataset.tolerance_s, dataset._video_backend, return_uint8=True)
+        start, stop = stop, stop + len(timestamps)
+        frames[start:stop] = decode_video_frames(
+            path, timestamps, dataset.tolerance_s, dataset._video_backend, return_uint8=True
         )
-    return torch.cat(frames)
+    return frames

@@ -75,6 +75,8 @@ class HDPPolicy(PreTrainedPolicy):
     def __init__(self, config: HDPConfig, dataset_stats: Any = None, dataset_meta: Any = None):
         super().__init__(config)
         config.validate_features()
+        if config.num_candidates > 1 and not self.can_score:
+            raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
         if dataset_meta is not None:
             _check_episodes_fit(config, dataset_meta.episodes["length"])
         self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
@@ -90,6 +92,9 @@ class HDPPolicy(PreTrainedPolicy):
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
         self.register_buffer("forward_calls", torch.tensor(0))
         self.reset()
+
+    def _make_planner(self) -> Planner:
+        return Planner(self.config, self.symbol_process.num_states if self.symbol_process else 0)
 
     def get_optim_params(self) -> list[dict]:
         return self.planner.parameter_groups()
@@ -113,20 +118,20 @@ class HDPPolicy(PreTrainedPolicy):
             The loss, and its two parts for logging.
         """
         if not self.training:
-            return self._loss(batch, self._planning_network)
+            return self._loss(batch, self._planning_network, None)
         self.forward_calls += 1
+        step = [int(self.noise_seed), int(self.forward_calls)]
+        generator = Generator(self._device).manual_seed(_seed(*step))
         with torch.random.fork_rng(devices=self._cuda_devices):
-            step = np.random.SeedSequence([int(self.noise_seed), int(self.forward_calls)])
-            torch.manual_seed(int(step.generate_state(1)[0]))
-            return self._loss(batch, self.planner)
+            torch.manual_seed(_seed(*step, 1 + _rank_and_world_size()[0]))  # of dropout
+            return self._loss(batch, self.planner, generator)
 
-    def _make_planner(self) -> Planner:
-        return Planner(self.config, self.symbol_process.num_states if self.symbol_process else 0)
-
-    def _loss(self, batch: dict[str, Tensor], network: Planner) -> tuple[Tensor, dict[str, float]]:
+    def _loss(
+        self, batch: dict[str, Tensor], network: Planner, generator: Generator | None
+    ) -> tuple[Tensor, dict[str, float]]:
         motion = batch[ACTION]
-        levels = self._sample_levels(self.motion_process, len(motion))
-        noisy_motion = self._corrupt(self.motion_process, motion, levels)
+        levels = self._sample_levels(self.motion_process, len(motion), generator)
+        noisy_motion = self._corrupt(self.motion_process, motion, levels, generator)
         observation, k_c = network.encoder(batch), noisy_motion.level
         if self.symbol_process is None:
             prediction = network.denoiser(noisy_motion.value, None, observation, k_c, torch.zeros_like(k_c))
@@ -134,8 +139,8 @@ class HDPPolicy(PreTrainedPolicy):
             return loss, {"motion_loss": loss.item()}
 
         if not self.config.shared_level:
-            levels = self._sample_levels(self.symbol_process, len(motion))
-        corrupted_symbols = self._corrupt(self.symbol_process, batch[OBS_SYMBOLIC_PLAN], levels)
+            levels = self._sample_levels(self.symbol_process, len(motion), generator)
+        corrupted_symbols = self._corrupt(self.symbol_process, batch[OBS_SYMBOLIC_PLAN], levels, generator)
         prediction = network.denoiser(
             noisy_motion.value, corrupted_symbols.value, observation, k_c, corrupted_symbols.level
         )
@@ -144,19 +149,19 @@ class HDPPolicy(PreTrainedPolicy):
         loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
         return loss, {"motion_loss": motion_loss.item(), "symbol_loss": symbol_loss.item()}
 
-    def _sample_levels(self, process: Process, batch_size: int) -> Tensor:
+    def _sample_levels(self, process: Process, batch_size: int, generator: Generator | None) -> Tensor:
         """Levels for the batches of all processes of a distributed run, (processes x B,); see `_corrupt`."""
-        return process.sample_level(_rank_and_world_size()[1] * batch_size, self._device)
+        return process.sample_level(_rank_and_world_size()[1] * batch_size, self._device, generator)
 
-    def _corrupt(self, process: Process, clean: Tensor, levels: Tensor) -> Corrupted:
+    def _corrupt(self, process: Process, clean: Tensor, levels: Tensor, generator: Generator | None) -> Corrupted:
         """Corrupt this process' batch, as one process would corrupt it as a part of the batches of all of them.
 
-        So a run on n devices is the run on one device with n times the batch size.
+        So a run on n devices has the noise of a run on one device with n times the batch size.
         """
         rank, world_size = _rank_and_world_size()
         if world_size == 1:
-            return process.corrupt(clean, levels)
-        corrupted = process.corrupt(clean.repeat(world_size, *[1] * (clean.ndim - 1)), levels)
+            return process.corrupt(clean, levels, generator)
+        corrupted = process.corrupt(clean.repeat(world_size, *[1] * (clean.ndim - 1)), levels, generator)
         own = slice(rank * len(clean), (rank + 1) * len(clean))
         return Corrupted(corrupted.value[own], corrupted.target[own], corrupted.level[own])
 
@@ -253,6 +258,7 @@ class HDPPolicy(PreTrainedPolicy):
         if not isinstance(prompt, PlanPrompt):
             texts = [prompt] * self._batch_size(batch) if isinstance(prompt, str) else list(prompt)
             prompt = PlanPrompt(token_ids=self._place_words(batch, texts, generator))
+        prompt = prompt.to(self._device)
         self._check_prompt(prompt, self._batch_size(batch))
         return prompt
 
@@ -390,6 +396,11 @@ def _moving_average(network: nn.Module, config: HDPConfig) -> AveragedModel:
 
     average = AveragedModel(network, multi_avg_fn=update)
     return average.requires_grad_(False).eval()
+
+
+def _seed(*numbers: int) -> int:
+    """A seed that follows from some numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
 def _rank_and_world_size() -> tuple[int, int]:

@@ -89,12 +89,13 @@ def _steps(length: int, step_ends: StepEnds | None, tokens_per_row: int = 6) -> 
     """The tokens of each row, and its waypoints where they are known."""
     if step_ends is None:
         return [{"tokens": [i, min(i + tokens_per_row, length)]} for i in range(0, length, tokens_per_row)]
-    ends = [(0, 0), *step_ends]
-    return [
+    rows: list[dict[str, Any]] = [
         {"tokens": [tokens, min(next_tokens, length)], "waypoints": [first, stop]}
-        for (tokens, first), (next_tokens, stop) in pairwise(ends)
+        for (tokens, first), (next_tokens, stop) in pairwise([(0, 0), *step_ends])
         if tokens < length
     ]
+    beyond = step_ends[-1][0]
+    return [*rows, {"tokens": [beyond, length]}] if beyond < length else rows
 
 
 def _data_url(image: np.ndarray) -> str:

@@ -60,6 +60,11 @@ class PlanPrompt:
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         return PlanPrompt(**{name: _repeat(value, times) for name, value in given.items()})
 
+    def to(self, device: torch.device) -> "PlanPrompt":
+        """The same on a device."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        return PlanPrompt(**{name: None if value is None else value.to(device) for name, value in given.items()})
+
 
 def _repeat(value: Tensor | None, times: int) -> Tensor | None:
     return None if value is None else value.repeat_interleave(times, dim=0)
@@ -119,9 +124,10 @@ class Plan:
         words = self.symbols(index)
         if not words:
             return "(no symbols)"
-        assert self.token_probabilities is not None
-        drawn = zip(words, self.token_probabilities[index].tolist(), strict=False)
-        tokens = [f"{word} {probability:.2f}" for word, probability in drawn]
+        tokens = words
+        if self.token_probabilities is not None and self.token_probabilities.shape[1]:
+            drawn = zip(words, self.token_probabilities[index].tolist(), strict=False)
+            tokens = [f"{word} {probability:.2f}" for word, probability in drawn]
         if step_ends is None:
             return "\n".join("  ".join(tokens[start : start + 6]) for start in range(0, len(tokens), 6))
         lines = []
@@ -129,6 +135,8 @@ class Plan:
             if tokens[first_token:next_token]:
                 waypoints = f"waypoints {first}-{stop - 1}"
                 lines.append(f"{waypoints:18}" + "  ".join(tokens[first_token:next_token]))
+        if beyond := tokens[step_ends[-1][0] :]:
+            lines.append(f"{'after the motion':18}" + "  ".join(beyond))
         return "\n".join(lines)
 
     def __str__(self) -> str:

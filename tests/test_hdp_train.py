@@ -1,5 +1,6 @@
 """`hdp-train`: the same samples as LeRobot reads, the same training as `lerobot-train` does, from memory."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -86,6 +87,13 @@ def test_samples_are_those_of_lerobot(dataset_root, episodes):
     assert_same_samples(LeRobotDataset("test/sorting", root=dataset_root, episodes=episodes, delta_timestamps=windows))
 
 
+@pytest.mark.parametrize("camera_root", ["video"], indirect=True)
+def test_images_of_some_episodes_are_theirs(camera_root):
+    assert_same_samples(
+        LeRobotDataset("test/cameras", root=camera_root, episodes=[3, 0, 2], return_uint8=True, video_backend="pyav")
+    )
+
+
 @pytest.mark.parametrize("return_uint8", [True, False])
 @pytest.mark.parametrize("offsets", [None, [0.0], [-0.2, 0.0, 0.1]])
 def test_images_are_those_of_lerobot(camera_root, offsets, return_uint8):
@@ -146,7 +154,7 @@ def assert_same_weights(one, other):
 
 
 def losses(result):
-    return re.findall(r" loss:([\d.]+)", result.stderr)
+    return re.findall(r"(?: loss:|eval_loss=)([\d.]+)", result.stderr)
 
 
 @pytest.fixture(scope="module")
@@ -157,10 +165,12 @@ def lerobot_train_run(dataset_root, tmp_path_factory):
 
 def test_the_planner_ends_with_the_weights_of_lerobot_train(dataset_root, lerobot_train_run, tmp_path):
     expected, expected_dir = lerobot_train_run
-    result = train("hdp-train", dataset_root, tmp_path / "run", PLANNER_FLAGS)
+    result = train("hdp-train", dataset_root, tmp_path / "run", PLANNER_FLAGS, "--num_workers=3")
     assert len(losses(result)) == STEPS
     assert losses(result) == losses(expected)
     assert_same_weights(weights(tmp_path / "run"), weights(expected_dir))
+    config = tmp_path / "run/checkpoints/last/pretrained_model/train_config.json"
+    assert json.loads(config.read_text())["num_workers"] == 3
 
 
 def test_a_run_that_is_out_of_time_leaves_a_checkpoint_and_goes_on_from_it(dataset_root, lerobot_train_run, tmp_path):
@@ -197,5 +207,5 @@ def test_other_policies_train_with_cameras(camera_root, tmp_path, policy_flags):
     by_lerobot, in_memory = (
         train(command, camera_root, tmp_path / command, flags) for command in ("lerobot-train", "hdp-train")
     )
-    assert len(losses(by_lerobot)) == STEPS
+    assert len(losses(by_lerobot)) == STEPS + 2  # two evaluations on held-out episodes
     assert losses(in_memory) == losses(by_lerobot)

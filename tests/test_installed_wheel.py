@@ -15,7 +15,10 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 register_third_party_plugins()
-assert "hdp" in PreTrainedConfig.get_known_choices()
+planners = {"hdp", "diffuser", "joint_diffuser", "separate_diffuser", "hd", "chd"}
+assert planners <= set(PreTrainedConfig.get_known_choices())
+import dataset_tools.record, lerobot_hdp.page, lerobot_hdp.scripts.hdp_train
+assert lerobot_hdp.page.TEMPLATE.exists()
 assert "hdp" in EnvConfig.get_known_choices()
 gymnasium.make("hdp/XArmSorting-v0").reset(seed=0)
 print(lerobot_policy_hdp.__file__)

@@ -124,17 +124,23 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
         actions = F.pad(prompt.actions, (0, 0, 0, missing))
         return PlanPrompt(actions=self._to_segments(actions), actions_given=self._to_segments(given)[..., 0])
 
-    def _loss(self, batch: dict[str, Tensor], network: HierarchicalPlanner) -> tuple[Tensor, dict[str, float]]:
+    def _loss(
+        self, batch: dict[str, Tensor], network: HierarchicalPlanner, generator: Generator | None
+    ) -> tuple[Tensor, dict[str, float]]:
         """Each level's squared error; the low level is trained on the demonstration's own sub-goals."""
         process = self.motion_process
         states, segments = self._states(batch), self._to_segments(batch[ACTION])
         state, subgoals = states[:, 0], states[:, 1:]
 
-        noisy_subgoals = self._corrupt(process, subgoals, self._sample_levels(process, len(subgoals)))
+        noisy_subgoals = self._corrupt(
+            process, subgoals, self._sample_levels(process, len(subgoals), generator), generator
+        )
         prediction = network.denoise_subgoals(noisy_subgoals.value, state, noisy_subgoals.level, None)
         subgoal_loss = process.loss(prediction, noisy_subgoals).mean()
 
-        noisy_segments = self._corrupt(process, segments, self._sample_levels(process, len(segments)))
+        noisy_segments = self._corrupt(
+            process, segments, self._sample_levels(process, len(segments), generator), generator
+        )
         prediction = network.denoise_segments(noisy_segments.value, state, subgoals, noisy_segments.level)
         motion_loss = process.loss(prediction, noisy_segments).mean()
         return subgoal_loss + motion_loss, {"subgoal_loss": subgoal_loss.item(), "motion_loss": motion_loss.item()}
@@ -185,14 +191,16 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
     config_class = CoupledHierarchicalDiffuserConfig
     name = "chd"
 
-    def _loss(self, batch: dict[str, Tensor], network: HierarchicalPlanner) -> tuple[Tensor, dict[str, float]]:
+    def _loss(
+        self, batch: dict[str, Tensor], network: HierarchicalPlanner, generator: Generator | None
+    ) -> tuple[Tensor, dict[str, float]]:
         """Each level's squared error, at the same step k, each conditioned on the other as in planning."""
         process = self.motion_process
         states, segments = self._states(batch), self._to_segments(batch[ACTION])
         state, subgoals = states[:, 0], states[:, 1:]
-        levels = self._sample_levels(process, len(state))
-        noisy_subgoals = self._corrupt(process, subgoals, levels)
-        noisy_segments = self._corrupt(process, segments, levels.repeat_interleave(self.config.num_segments))
+        levels = self._sample_levels(process, len(state), generator)
+        noisy_subgoals = self._corrupt(process, subgoals, levels, generator)
+        noisy_segments = self._corrupt(process, segments, levels.repeat_interleave(self.config.num_segments), generator)
         high, low = self._denoise_both(network, noisy_subgoals.value, noisy_segments.value, state, noisy_subgoals.level)
         subgoal_loss = process.loss(high, noisy_subgoals).mean()
         motion_loss = process.loss(low, noisy_segments).mean()

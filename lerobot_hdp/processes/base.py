@@ -28,7 +28,7 @@ class Corrupted:
 class Process(Protocol):
     """Corrupts clean data step by step, and knows how to go back."""
 
-    def sample_level(self, batch_size: int, device: torch.device) -> Tensor:
+    def sample_level(self, batch_size: int, device: torch.device, generator: Generator | None = None) -> Tensor:
         """Levels to train on: (B,)."""
         ...
 

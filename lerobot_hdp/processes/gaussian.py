@@ -56,8 +56,8 @@ class GaussianProcess:
             self._alpha_bar = self._alpha_bar.to(level.device)
         return self._alpha_bar[(level * self.num_train_timesteps).round().long()]
 
-    def sample_level(self, batch_size: int, device: torch.device) -> Tensor:
-        step = torch.randint(1, self.num_train_timesteps + 1, (batch_size,), device=device)
+    def sample_level(self, batch_size: int, device: torch.device, generator: Generator | None = None) -> Tensor:
+        step = torch.randint(1, self.num_train_timesteps + 1, (batch_size,), device=device, generator=generator)
         return step / self.num_train_timesteps
 
     def corrupt(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Corrupted:

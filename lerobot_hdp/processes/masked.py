@@ -38,10 +38,10 @@ class MaskedProcess:
         self.mask_id = vocabulary_size
         self.num_states = vocabulary_size + 1
 
-    def sample_level(self, batch_size: int, device: torch.device) -> Tensor:
+    def sample_level(self, batch_size: int, device: torch.device, generator: Generator | None = None) -> Tensor:
         """Low-discrepancy sampling (Kingma et al. 2021): one level in each of B equal parts of (0, 1]."""
-        offsets = torch.randperm(batch_size, device=device)
-        uniform = (torch.rand(1, device=device) + offsets) / batch_size
+        offsets = torch.randperm(batch_size, device=device, generator=generator)
+        uniform = (torch.rand(1, device=device, generator=generator) + offsets) / batch_size
         return MIN_LEVEL + (1 - MIN_LEVEL) * uniform
 
     def corrupt(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Corrupted:

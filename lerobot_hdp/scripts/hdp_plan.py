@@ -143,6 +143,8 @@ def make_plan(config: PlanConfig) -> Result:
     """
     set_seed(config.seed)
     policy, preprocessor, postprocessor = _load(config)
+    if config.check and policy.config.num_candidates == 1:
+        raise ValueError("--check=true chooses among candidates: set --policy.num_candidates to more than 1")
     env_preprocessor, _ = make_env_pre_post_processors(config.env, config.policy)
     task = getattr(config.env, "planning_task", None)
     vector_envs = make_env(config.env, n_envs=1)

@@ -1,10 +1,10 @@
 """`hdp-train`: LeRobot's own training, with the dataset in memory, for any policy and any dataset that fits.
 
 Takes all flags of `lerobot-train`, and does what it does with them, from checkpoints to `--resume` and `accelerate
-launch`: it runs LeRobot's training function. What it changes are three names in LeRobot's module, below, where LeRobot
-0.6.1 has no hook: the function that opens the datasets, the one that collates a batch with language columns, and, for
-`--max_train_minutes`, the two that decide about a checkpoint and do a step. A `dataset_factory` and a `should_stop`
-argument of `lerobot.scripts.lerobot_train.train` would make this unnecessary.
+launch`: it runs LeRobot's training function. What it changes are some names in LeRobot's module, below, where LeRobot
+0.6.1 has no hook: the functions that open the datasets, collate a batch with language columns and write a checkpoint,
+and, for `--max_train_minutes`, those that decide about a checkpoint and do a step. A `dataset_factory` and a
+`should_stop` argument of `lerobot.scripts.lerobot_train.train` would make this unnecessary.
 
 Example:
     hdp-train --config_path=configs/xarm_sorting.json --max_train_minutes=30
@@ -33,8 +33,11 @@ class OutOfTimeError(Exception):
 def hold_datasets_in_memory(max_gib: float) -> None:
     """Let `lerobot-train` hold its datasets in memory, if they need at most `max_gib` GiB; else it reads as always."""
     make_datasets, collate = lerobot_train.make_train_eval_datasets, lerobot_train.lerobot_collate_fn
+    save_checkpoint, users_num_workers = lerobot_train.save_checkpoint, None
 
     def make_datasets_in_memory(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
+        nonlocal users_num_workers
+        users_num_workers = cfg.num_workers
         datasets = make_datasets(cfg)
         for dataset in filter(None, datasets):
             reason = unsupported(dataset)
@@ -49,15 +52,30 @@ def hold_datasets_in_memory(max_gib: float) -> None:
     def collate_unless_collated(samples: list[Any]) -> Any:
         return samples[0] if isinstance(samples[0], Batch) else collate(samples)
 
+    def save_with_users_num_workers(*args: Any, cfg: TrainPipelineConfig, **kwargs: Any) -> None:
+        cfg.num_workers = users_num_workers  # for whoever resumes with lerobot-train
+        save_checkpoint(*args, cfg=cfg, **kwargs)
+
     lerobot_train.make_train_eval_datasets = make_datasets_in_memory
+    lerobot_train.save_checkpoint = save_with_users_num_workers
     lerobot_train.lerobot_collate_fn = collate_unless_collated
 
 
 def stop_after(minutes: float) -> None:
-    """Let `lerobot-train` write a checkpoint after some minutes, then raise OutOfTimeError."""
+    """Let `lerobot-train` write a checkpoint after some minutes, then raise OutOfTimeError.
+
+    Raises:
+        ValueError: from the training, if it writes no checkpoints.
+    """
+    make_datasets = lerobot_train.make_train_eval_datasets
     deadline = time.monotonic() + 60 * minutes
     should_save, update_policy = lerobot_train.should_save_checkpoint, lerobot_train.update_policy
     out_of_time = False
+
+    def make_datasets_if_saved(cfg: TrainPipelineConfig) -> Any:
+        if not cfg.save_checkpoint:
+            raise ValueError("--max_train_minutes ends with a checkpoint: it needs --save_checkpoint=true")
+        return make_datasets(cfg)
 
     def should_save_or_stop(step: int, save_freq: int, total_steps: int) -> bool:
         nonlocal out_of_time
@@ -69,6 +87,7 @@ def stop_after(minutes: float) -> None:
             raise OutOfTimeError
         return update_policy(*args, **kwargs)
 
+    lerobot_train.make_train_eval_datasets = make_datasets_if_saved
     lerobot_train.should_save_checkpoint = should_save_or_stop
     lerobot_train.update_policy = update_unless_out_of_time
 
@@ -88,7 +107,9 @@ def main() -> None:
         "hdp-train", description="lerobot-train with the dataset in memory.", add_help=False, allow_abbrev=False
     )
     parser.add_argument("--max_train_minutes", type=float, help="write a checkpoint and stop after this time")
-    parser.add_argument("--max_memory_gib", type=float, default=8.0, help="largest dataset to hold in memory, in GiB")
+    parser.add_argument(
+        "--max_memory_gib", type=float, default=8.0, help="largest dataset to hold in each process's memory, in GiB"
+    )
     options, sys.argv[1:] = parser.parse_known_args()
     if "--help" in sys.argv or "-h" in sys.argv:
         parser.print_help()
