@@ -40,7 +40,7 @@ quickstart: setup
 		print(f\"success rate: {r['pc_success']:.0f} % of {r['n_episodes']} fresh starts; videos: $(OUT)/eval/videos\")"
 
 test: setup
-	$(BIN)/python -m pytest tests
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests -n 2 --dist loadfile
 
 lint: setup
 	$(BIN)/ruff check .
