@@ -75,6 +75,10 @@ def test_what_is_wrong_with_a_plan_that_arranges():
         (TOOL_USE, []),
         (TOOL_USE.replace("DRAG BLUE ", ""), ["move 3: STACK BLUE comes before DRAG BLUE"]),
         (TOOL_USE.replace("STACK GREEN ", ""), ["GREEN is never stacked"]),
+        (
+            "DRAG RED STACK RED DRAG BLUE DRAG GREEN STACK BLUE STACK GREEN",
+            ["move 2: STACK RED comes while the hook is still needed"],
+        ),
         (TOOL_USE + " STACK RED", ["move 7: STACK RED comes a second time"]),
         (TOOL_USE + " RED", ["move 7, word 1: 'RED' stands where DRAG or STACK should"]),
     ],
