@@ -29,7 +29,7 @@ from lerobot_hdp.modeling_hdp import HDPPolicy
 from .machine import describe_run
 
 RESULTS = Path(__file__).parent / "results" / "planner_latency.json"
-TABLE = Path("docs/planner_latency.md")
+TABLE = Path(__file__).parents[1] / "docs" / "planner_latency.md"
 PLANNERS = ("diffuser", "hdp", "joint_diffuser", "separate_diffuser", "hd", "chd")
 REFERENCE = "diffuser"
 PAPER_SYMBOLIC_HORIZON = 108

@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 
 from .planner_latency import PLANNERS
 
-DOCS = Path("docs")
+DOCS = Path(__file__).parents[1] / "docs"
 TABLE, PLOT = DOCS / "planner_comparison.md", DOCS / "images" / "planner_comparison.svg"
 LAST = 3
 """Evaluations at the end of a learning curve that make the table's figures."""
+NETWORK = ("num_layers", "width", "dtype", "num_inference_steps")
+"""Options of all planners that cells must share to be compared."""
 LABELS = {
     "hdp": "HDP",
     "diffuser": "Diffuser",
@@ -53,9 +55,18 @@ def read_results(files: Iterable[Path]) -> tuple[Results, set[str]]:
         commits.add(content["run"]["git_commit"])
     for panel, planners in results.items():
         cells = [cell for seeds in planners.values() for cell in seeds]
-        protocols = {(cell["curve"][-1]["step"], cell["batch_size"], cell["starts"]) for cell in cells}
+        protocols = {
+            (
+                cell["curve"][-1]["step"],
+                cell["batch_size"],
+                cell["starts"],
+                *(cell["policy"].get(key) for key in NETWORK),
+            )
+            for cell in cells
+        }
         if len(protocols) > 1:
-            raise ValueError(f"{panel.title}: cells of different (steps, batch size, starts): {sorted(protocols)}")
+            names = ", ".join(("steps", "batch size", "starts", *NETWORK))
+            raise ValueError(f"{panel.title}: cells of different ({names}): {protocols}")
     return dict(sorted(results.items())), commits
 
 

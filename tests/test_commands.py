@@ -106,6 +106,13 @@ def test_lerobot_eval_scores_the_policy(checkpoint, tmp_path):
     assert all(Path(path).stat().st_size > 1000 for path in overall["video_paths"])
 
 
+def test_lerobot_eval_reads_the_prompt(checkpoint, tmp_path):
+    flags = (f"--policy.path={checkpoint}", "--policy.prompt=PICK D", *ENV_FLAGS, f"--output_dir={tmp_path}")
+    result = run_command("lerobot-eval", *flags, check=False)
+    assert result.returncode != 0
+    assert "unknown symbol 'D' (word 2 of the prompt)" in result.stderr
+
+
 def test_a_checkpoint_can_be_fine_tuned(dataset_root, checkpoint, tmp_path):
     train(dataset_root, tmp_path / "tuned", "--steps=2", policy_flags=[f"--policy.path={checkpoint}"])
     tuned = load_file(tmp_path / "tuned/checkpoints/last/pretrained_model/model.safetensors")
