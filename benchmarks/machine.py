@@ -14,7 +14,8 @@ def describe_run() -> dict[str, object]:
     """The command, the code, the machine and the versions of the packages that matter, for a results file."""
     return {
         "command": "python -m " + " ".join([_module_name(), *sys.argv[1:]]),
-        "git_commit": _git("rev-parse", "--short", "HEAD") + ("+changes" if _git("status", "--porcelain") else ""),
+        "git_commit": _git("rev-parse", "--short", "HEAD")
+        + ("+changes" if _git("status", "--porcelain", "--", "*.py", "*.json", ":!benchmarks/results") else ""),
         "cpu": _cpu_name(),
         "cores": os.cpu_count(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
