@@ -92,6 +92,20 @@ def inputs(make_planner, batch):
     return {name: value for name, value in preprocessor(batch).items() if name in names}
 
 
+def train_in_process(policy, inputs, steps: int) -> list[dict[str, float]]:
+    """Optimise on one preprocessed batch; the parts of the loss at each step."""
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    history = []
+    policy.train()
+    for _ in range(steps):
+        loss, parts = policy.forward(inputs)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        history.append(parts)
+    return history
+
+
 class Demonstrations(NamedTuple):
     """Starts, and what the expert does there: n observations, actions in metres, and plans in words."""
 

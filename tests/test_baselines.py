@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from lerobot_hdp import FREE, PlanPrompt
 from lerobot_hdp.prompt import encode_prompt
 
-from .conftest import HORIZON, TASK_FLAGS, TINY_PLANNER
+from .conftest import HORIZON, TASK_FLAGS, TINY_PLANNER, train_in_process
 
 CONTINUOUS_SYMBOLS = ["joint_diffuser", "separate_diffuser"]
 WITH_SYMBOLS = ["hdp", *CONTINUOUS_SYMBOLS]
@@ -69,15 +69,7 @@ class TestContract:
     @pytest.mark.parametrize("prediction_type", ["sample", "epsilon"])
     def test_every_part_of_the_loss_falls(self, make_planner, training_batch, planner, prediction_type):
         policy, preprocessor, _ = make_planner(planner, prediction_type=prediction_type)
-        optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
-        inputs, history = preprocessor(training_batch(policy)), []
-        policy.train()
-        for _ in range(60):
-            loss, parts = policy.forward(inputs)
-            loss.backward()
-            optimizer.step()
-            optimizer.zero_grad()
-            history.append(parts)
+        history = train_in_process(policy, preprocessor(training_batch(policy)), steps=60)
         for name in history[0]:
             first, last = (sum(parts[name] for parts in part) for part in (history[:10], history[-10:]))
             assert last < 0.8 * first

@@ -9,7 +9,7 @@ from lerobot_hdp import FREE, HDPConfig, PlanPrompt
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.prompt import encode_prompt
 
-from .conftest import HORIZON, TINY_PLANNER
+from .conftest import HORIZON, TINY_PLANNER, train_in_process
 
 
 def observation(batch):
@@ -61,15 +61,7 @@ def test_loss_is_the_weighted_sum_of_its_logged_parts(make_planner, batch):
 
 def test_both_losses_fall_in_training(make_planner, batch):
     policy, preprocessor, _ = make_planner(ema_max_decay=0)
-    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
-    inputs, history = preprocessor(batch), []
-    policy.train()
-    for _ in range(60):
-        loss, parts = policy.forward(inputs)
-        loss.backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        history.append(parts)
+    history = train_in_process(policy, preprocessor(batch), steps=60)
     for name in ("motion_loss", "symbol_loss"):
         first, last = (sum(parts[name] for parts in part) for part in (history[:10], history[-10:]))
         assert last < 0.7 * first

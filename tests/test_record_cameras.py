@@ -1,7 +1,6 @@
 """`hdp-record` with cameras and with LeRobot's language columns, read back by LeRobot itself."""
 
 import itertools
-from importlib.util import find_spec
 from pathlib import Path
 
 import gymnasium as gym
@@ -144,7 +143,6 @@ def test_cameras_that_a_task_cannot_have_are_refused_before_anything_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(find_spec("diffusers") is None, reason="needs lerobot[diffusion]")
 def test_lerobot_trains_its_own_diffusion_policy_on_it(dataset, tmp_path):
     result = run_command(
         "lerobot-train",

@@ -19,21 +19,6 @@ class DiffuserConfig(HDPConfig):
     symbol_process = None
 
 
-@PreTrainedConfig.register_subclass("joint_diffuser")
-@dataclass
-class JointDiffuserConfig(HDPConfig):
-    """Joint Diffuser: motion and one-hot symbols are one continuous variable, with one diffusion step k for both.
-
-    Attributes:
-        symbol_loss_weight: weight of the symbols' mean squared error beside the motion's.
-    """
-
-    symbol_process = "gaussian"
-    shared_level = True
-
-    symbol_loss_weight: float | None = 0.1
-
-
 @PreTrainedConfig.register_subclass("separate_diffuser")
 @dataclass
 class SeparateDiffuserConfig(HDPConfig):
@@ -46,3 +31,11 @@ class SeparateDiffuserConfig(HDPConfig):
     symbol_process = "gaussian"
 
     symbol_loss_weight: float | None = 0.1
+
+
+@PreTrainedConfig.register_subclass("joint_diffuser")
+@dataclass
+class JointDiffuserConfig(SeparateDiffuserConfig):
+    """Joint Diffuser: motion and one-hot symbols are one continuous variable, with one diffusion step k for both."""
+
+    shared_level = True
