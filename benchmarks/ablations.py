@@ -3,30 +3,24 @@
 python -m benchmarks.ablations              # runs what is missing, then writes docs/ablations.md
 python -m benchmarks.ablations --list       # says what is finished and what is not
 
-A cell is one variant, trained with one seed as `benchmarks.planner_comparison` trains; its learning curve goes to
+A cell (see cells.py) is one variant of the `mini` preset's HDP, trained with one seed; its learning curve goes to
 `benchmarks/results/ablations/<cell>.json`. A finished cell is never run again, an interrupted one goes on.
 """
 
 import argparse
 import json
-import multiprocessing
 from collections import defaultdict
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from . import planner_comparison
-from .machine import describe_run
-from .planner_comparison import Cell, Protocol, run_cell, state_of
+from .cells import Cell, run_cells
+from .paper.presets import make_cell
 
-RESULTS = Path(__file__).parent / "results" / "ablations"
 PAGE = Path(__file__).parents[1] / "docs" / "ablations.md"
-PROTOCOL = Protocol(network={"num_layers": 4, "width": 128, "dtype": "bfloat16"})
-LAST = 3
-"""Evaluations at the end of a learning curve that make the table's figures."""
+STEPS = 1500
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "prediction_type=epsilon": {"prediction_type": "epsilon"},
@@ -43,43 +37,34 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-@dataclass(frozen=True)
-class AblationCell(Cell):
-    """A variant of HDP, trained once."""
-
-    variant: str = "default"
-
-    @property
-    def name(self) -> str:
-        variant = self.variant.replace(", ", "_").replace("/", "_")
-        return f"{self.n_blocks}_blocks_{variant}_seed{self.seed}"
-
-    @property
-    def result_file(self) -> Path:
-        return RESULTS / f"{self.name}.json"
-
-    @property
-    def checkpoint(self) -> Path:
-        return planner_comparison.WORK.with_name("ablations") / self.name
-
-    def policy_options(self, protocol: Protocol) -> dict[str, Any]:
-        return {**protocol.network, **VARIANTS[self.variant]}
+def variant_of(name: str, n_blocks: int, seed: int) -> Cell:
+    """The cell of a variant, a number of blocks and a seed."""
+    cell = make_cell("mini", f"block_sorting_2d_{n_blocks}_blocks", "hdp", seed)
+    return replace(
+        cell,
+        group="ablations",
+        name=f"{n_blocks}_blocks_{name.replace(', ', '_').replace('/', '_')}_seed{seed}",
+        steps=STEPS,
+        policy={**cell.policy, **VARIANTS[name]},
+        facts={"variant": name, "n_blocks": n_blocks},
+    )
 
 
-def write_page(cells: list[AblationCell]) -> None:
+def write_page(cells: list[Cell]) -> None:
     """The table of all finished cells."""
     scores: dict[tuple[str, int], list[float]] = defaultdict(list)
     for cell in cells:
         if cell.result_file.exists():
-            curve = json.loads(cell.result_file.read_text())["result"]["curve"]
-            scores[cell.variant, cell.n_blocks].append(100 * mean(point["success_rate"] for point in curve[-LAST:]))
-    blocks = sorted({cell.n_blocks for cell in cells})
+            result = json.loads(cell.result_file.read_text())["result"]
+            rates = [point["success_rate"] for point in result["curve"][-cell.average_last :]]
+            scores[result["variant"], result["n_blocks"]].append(100 * mean(rates))
+    blocks, cell = sorted({cell.facts["n_blocks"] for cell in cells}), cells[0]
     page = "# What helps HDP to learn\n\n"
     page += (
-        f"Success in % after {PROTOCOL.steps} steps of {PROTOCOL.batch_size} samples, the mean over the last {LAST} "
-        f"evaluations of {PROTOCOL.starts} fresh starts, for each seed; one setting of the `default` preset changed at "
-        f"a time. 2D sorting, {PROTOCOL.num_episodes} demonstrations, 4 layers of width 128. "
-        "`python -m benchmarks.ablations`\n\n"
+        f"Success in % after {cell.steps} steps of {cell.batch_size} samples, the mean over the last "
+        f"{cell.average_last} evaluations of {cell.starts} fresh starts, for each seed; one setting of the `default` "
+        f"preset changed at a time. 2D sorting, {cell.demonstrations} demonstrations, {cell.policy['num_layers']} "
+        f"layers of width {cell.policy['width']}. `python -m benchmarks.ablations`\n\n"
     )
     page += f"| setting | {' | '.join(f'{n} blocks' for n in blocks)} |\n|---|{'---|' * len(blocks)}\n"
     for variant in VARIANTS:
@@ -93,22 +78,16 @@ def main() -> None:
     parser.add_argument("--n_blocks", type=int, nargs="+", default=[3, 4])
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--processes", type=int, default=1, help="cells at a time, each on one core")
+    parser.add_argument("--processes", type=int, default=1, help="cells at a time, which share the cores")
     parser.add_argument("--list", action="store_true")
     options = parser.parse_args()
-    cells = [
-        AblationCell(n_blocks, VARIANTS[variant].get("prediction_type", "sample"), "hdp", seed, variant)
-        for n_blocks, seed, variant in product(options.n_blocks, options.seeds, options.variants)
-    ]
+    cells = [variant_of(*choice) for choice in product(options.variants, options.n_blocks, options.seeds)]
+    cells.sort(key=lambda cell: cell.seed)
     if options.list:
         for cell in cells:
-            print(f"{cell.name:75} {state_of(cell)}")
+            print(f"{cell.name:75} {cell.state()}")
         return
-    run_facts, context = describe_run(), multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.processes, mp_context=context) as executor:
-        missing = [cell for cell in cells if not cell.result_file.exists()]
-        for future in [executor.submit(run_cell, cell, PROTOCOL, run_facts) for cell in missing]:
-            future.result()
+    run_cells(cells, options.processes)
     write_page(cells)
 
 

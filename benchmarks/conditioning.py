@@ -18,134 +18,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.policies import get_policy_class, make_pre_post_processors
 
 import lerobot_policy_hdp  # noqa: F401 (registers the policies and the tasks)
 from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
 from gym_hdp_tasks.block_sorting_2d import SLOT_HALF_SIZE, block_name
-from gym_hdp_tasks.open_loop import execute_plans
-from lerobot_hdp import PlanPrompt
 from lerobot_hdp.candidates import best_candidates
 
+from .evaluation import Subject, execute, load, make_plans, rate, wilson_interval
 from .machine import describe_run
-from .train_and_evaluate import RESULTS, wilson_interval
+from .train_and_evaluate import RESULTS
 
-FIRST_SEED = 0
-"""Demonstrations were recorded from seeds of 32 random bits."""
 CANDIDATES = (1, 2, 4, 8)
-BATCH = 50
-"""Plans that are made at once."""
-
-Outcome = dict[str, Any]
-"""`is_success`, and what else is known of an executed plan."""
-
-
-@dataclass
-class Subject:
-    """A planner, and the starts that it plans for.
-
-    Attributes:
-        path: of its checkpoint.
-        policy, postprocessor: the planner.
-        gym_id, parameters: what makes its task.
-        seeds: of the starts.
-        observations: as the environment gives them.
-        inputs: the same, preprocessed.
-    """
-
-    path: Path
-    policy: Any
-    postprocessor: Any
-    gym_id: str
-    parameters: dict[str, Any]
-    seeds: range
-    observations: list[dict[str, np.ndarray]]
-    inputs: dict[str, torch.Tensor]
-
-    def make_env(self) -> gym.Env:
-        return gym.make(self.gym_id, disable_env_checker=True, **self.parameters)
-
-    def facts(self) -> dict[str, Any]:
-        """What a results file says about it."""
-        train = json.loads((self.path / "train_config.json").read_text())
-        steps = self.policy.config.num_inference_steps or self.policy.config.num_train_timesteps
-        return {
-            "planner": self.policy.config.type,
-            "task": self.gym_id.removeprefix("hdp/"),
-            "parameters": self.parameters,
-            "train_steps": train["steps"],
-            "train_seed": train["seed"],
-            "network_calls_per_plan": steps,
-            "starts": len(self.seeds),
-        }
-
-
-def load(path: Path, starts: int, num_inference_steps: int | None, gym_id: str | None = None) -> Subject:
-    """Load a checkpoint and reset its task (or another one) to the first seeds."""
-    config = PreTrainedConfig.from_pretrained(path)
-    policy = get_policy_class(config.type).from_pretrained(path)
-    if num_inference_steps:
-        policy.config.num_inference_steps = num_inference_steps
-    device = {"device_processor": {"device": policy.config.device}}
-    preprocessor, postprocessor = make_pre_post_processors(policy.config, path, preprocessor_overrides=device)
-    task = TrainPipelineConfig.from_pretrained(path).env.planning_task
-    gym_id = gym_id or task.gym_id
-    env = gym.make(gym_id, disable_env_checker=True, **task.parameters)
-    seeds = range(FIRST_SEED, FIRST_SEED + starts)
-    observations = [env.reset(seed=seed)[0] for seed in seeds]
-    names = {"observation.state": "agent_pos", "observation.environment_state": "environment_state"}
-    stacked = {key: torch.tensor(np.stack([o[name] for o in observations])) for key, name in names.items()}
-    inputs = {key: value for key, value in preprocessor(stacked).items() if key in names}
-    return Subject(path, policy, postprocessor, gym_id, task.parameters, seeds, observations, inputs)
-
-
-def make_plans(subject: Subject, prompts: Sequence[str] | torch.Tensor | None = None) -> np.ndarray:
-    """A plan for each start, with its prompt, if any: (starts, horizon, D) in the task's units.
-
-    Args:
-        subject: the planner and the starts.
-        prompts: one for each start, as words or as token ids (starts, H_d).
-    """
-    torch.manual_seed(0)
-    motions = []
-    for first in range(0, len(subject.seeds), BATCH):
-        part = slice(first, first + BATCH)
-        prompt = None if prompts is None else prompts[part]
-        if isinstance(prompt, torch.Tensor):
-            prompt = PlanPrompt(token_ids=prompt.to(subject.policy.config.device))
-        inputs = {key: value[part] for key, value in subject.inputs.items()}
-        motions.append(subject.postprocessor(subject.policy.plan(inputs, prompt).actions))
-    return torch.cat(motions).numpy()
-
-
-def execute(subject: Subject, motions: np.ndarray, seeds: Sequence[int]) -> list[Outcome]:
-    """Carry plans out; in the plane, say which block the gripper took first."""
-    if "XArm" in subject.gym_id:
-        return execute_plans(subject.gym_id, seeds, motions, **subject.parameters)
-    env, outcomes = subject.make_env(), []
-    for seed, motion in zip(seeds, motions, strict=True):
-        env.reset(seed=seed)
-        first_block = None
-        for action in motion:
-            *_, info = env.step(action)
-            if first_block is None and env.unwrapped.held is not None:
-                first_block = block_name(env.unwrapped.held)
-        outcomes.append({**info, "first_block": first_block})
-    return outcomes
-
-
-def rate(hits: Sequence[bool]) -> dict[str, Any]:
-    """How often, with its 95 % interval (Wilson)."""
-    hits = [bool(hit) for hit in hits]
-    if not hits:
-        return {"rate": None, "of": 0}
-    return {"rate": round(np.mean(hits), 4), "interval_95": wilson_interval(sum(hits), len(hits)), "of": len(hits)}
 
 
 def adherence(checkpoints: Sequence[Path], starts: int, num_inference_steps: int | None) -> list[dict]:
@@ -163,7 +50,7 @@ def adherence(checkpoints: Sequence[Path], starts: int, num_inference_steps: int
             prompts, done, otherwise_good = [f"PICK {block}" for block in asked], "first_block", "is_success"
         result = subject.facts()
         for name, given in (("with_prompt", prompts), ("without_prompt", None)):
-            outcomes = execute(subject, make_plans(subject, given), subject.seeds)
+            outcomes = execute(subject, make_plans(subject, given).motions, subject.seeds)
             pairs = [(o[done] == block) for o, block in zip(outcomes, asked, strict=True) if o[otherwise_good]]
             result[name] = {"adherence": rate(pairs), otherwise_good: rate([o[otherwise_good] for o in outcomes])}
         print(json.dumps(result), flush=True)
@@ -194,7 +81,7 @@ def valid_plan(checkpoints: Sequence[Path], starts: int, num_inference_steps: in
             plans.append(subject.policy.vocabulary.encode(symbols, subject.policy.config.symbolic_horizon))
         result = subject.facts()
         for name, given in (("valid_plan_given", torch.stack(plans)), ("nothing_given", None)):
-            outcomes = execute(subject, make_plans(subject, given), subject.seeds)
+            outcomes = execute(subject, make_plans(subject, given).motions, subject.seeds)
             result[name] = {
                 "success": rate([o["is_success"] for o in outcomes]),
                 "mean_score": round(np.mean([o["score"] for o in outcomes]), 4),

@@ -27,8 +27,8 @@ import lerobot_policy_hdp  # noqa: F401 (registers the planners)
 from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.configuration_hdp import SAMPLERS
 
+from .evaluation import wilson_interval
 from .machine import describe_run
-from .train_and_evaluate import wilson_interval
 
 RESULTS = Path(__file__).parent / "results" / "few_step_planning"
 PAGE = Path(__file__).parents[1] / "docs" / "few_steps.md"

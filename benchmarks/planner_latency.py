@@ -26,11 +26,12 @@ from dataset_tools.record import RecordConfig, RecordDatasetConfig, dataset_feat
 from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.modeling_hdp import HDPPolicy
 
+from .cells import num_parameters
 from .machine import describe_run
+from .paper.presets import METHODS
 
 RESULTS = Path(__file__).parent / "results" / "planner_latency.json"
 TABLE = Path(__file__).parents[1] / "docs" / "planner_latency.md"
-PLANNERS = ("diffuser", "hdp", "joint_diffuser", "separate_diffuser", "hd", "chd")
 REFERENCE = "diffuser"
 PAPER_SYMBOLIC_HORIZON = 108
 """H_d of the paper's sorting tasks, filled with PAD."""
@@ -45,11 +46,6 @@ def make_planner(policy_type: str, env: HDPEnv, **options) -> HDPPolicy:
     config.output_features = {k: f for k, f in features.items() if f.type is FeatureType.ACTION}
     config.set_dataset_feature_metadata(columns)
     return get_policy_class(policy_type)(config).to(config.device).eval()
-
-
-def num_parameters(policy: HDPPolicy) -> int:
-    """Parameters of the network that is trained, without their moving average."""
-    return sum(parameter.numel() for parameter in policy.planner.parameters())
 
 
 def time_plan(policy: HDPPolicy, batch: dict[str, Tensor]) -> float:
@@ -101,7 +97,7 @@ def write_table() -> None:
         "| planner | parameters | over Diffuser |" + "".join(f" batch {n}, ms | over Diffuser |" for n in sizes),
         "|---|---|---|" + "---|---|" * len(sizes),
     ]
-    for name in PLANNERS:
+    for name in METHODS:
         cells = [f"`{name}`", f"{result['parameters'][name]:,}", f"{result['parameter_ratio'][name] - 1:+.1%}"]
         for measured in sizes.values():
             for low, middle, high in (measured[name]["ms"], measured[name]["ratio"]):
@@ -126,7 +122,7 @@ def main() -> None:
     env = HDPEnv(task=options.task)
     sizes = {name: getattr(options, name) for name in ("num_layers", "width", "num_inference_steps", "device")}
     planners = {}
-    for name in PLANNERS:
+    for name in METHODS:
         config_class = PreTrainedConfig.get_choice_class(name)
         symbols = {"symbolic_horizon": PAPER_SYMBOLIC_HORIZON} if config_class.symbol_process else {}
         planners[name] = make_planner(name, env, preset="paper", **sizes, **symbols)

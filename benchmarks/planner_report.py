@@ -7,14 +7,14 @@ from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple
 
-from .planner_latency import PLANNERS
+from .paper.presets import METHODS
 
 DOCS = Path(__file__).parents[1] / "docs"
 TABLE, PLOT = DOCS / "planner_comparison.md", DOCS / "images" / "planner_comparison.svg"
-LAST = 3
-"""Evaluations at the end of a learning curve that make the table's figures."""
-NETWORK = ("num_layers", "width", "dtype", "num_inference_steps")
-"""Options of all planners that cells must share to be compared."""
+PROTOCOL = ("demonstrations", "steps", "batch_size", "starts", "average_last", "network_calls_per_plan")
+"""What cells must share to be compared, ..."""
+NETWORK = ("num_layers", "width", "dtype")
+"""... and options of their planners, too."""
 LABELS = {
     "hdp": "HDP",
     "diffuser": "Diffuser",
@@ -51,39 +51,32 @@ def read_results(files: Iterable[Path]) -> tuple[Results, set[str]]:
     for file in files:
         content = json.loads(file.read_text())
         result = content["result"]
-        results[Panel(result["n_blocks"], result["prediction_type"])][result["planner"]].append(result)
+        blocks = int(result["task_name"].split("_")[-2])
+        prediction_type = result["policy"].get("prediction_type", "sample")
+        results[Panel(blocks, prediction_type)][result["planner"]].append(result)
         commits.add(content["run"]["git_commit"])
     for panel, planners in results.items():
         cells = [cell for seeds in planners.values() for cell in seeds]
-        protocols = {
-            (
-                cell["curve"][-1]["step"],
-                cell["batch_size"],
-                cell["starts"],
-                *(cell["policy"].get(key) for key in NETWORK),
-            )
-            for cell in cells
-        }
+        protocols = {(*(cell[key] for key in PROTOCOL), *(cell["policy"][key] for key in NETWORK)) for cell in cells}
         if len(protocols) > 1:
-            names = ", ".join(("steps", "batch size", "starts", *NETWORK))
-            raise ValueError(f"{panel.title}: cells of different ({names}): {protocols}")
+            raise ValueError(f"{panel.title}: cells of different ({', '.join(PROTOCOL + NETWORK)}): {protocols}")
     return dict(sorted(results.items())), commits
 
 
 def at_the_end(result: dict[str, Any], figure: str) -> float:
     """A figure's mean over the last evaluations of one cell."""
-    return mean(point[figure] for point in result["curve"][-LAST:])
+    return mean(point[figure] for point in result["curve"][-result["average_last"] :])
 
 
 def table(planners: dict[str, list[dict[str, Any]]]) -> Iterable[str]:
     """The rows of a panel's table."""
     yield "| planner | parameters | seeds | success | each seed | mean score | training |"
     yield "|---|---|---|---|---|---|---|"
-    for planner in sorted(planners, key=PLANNERS.index):
+    for planner in sorted(planners, key=METHODS.index):
         cells = sorted(planners[planner], key=lambda cell: cell["seed"])
         success = [at_the_end(cell, "success_rate") for cell in cells]
         score = mean(at_the_end(cell, "mean_score") for cell in cells)
-        minutes = mean(cell["curve"][-1]["train_s"] for cell in cells) / 60
+        minutes = mean(cell["train_s"] for cell in cells) / 60
         each = ", ".join(f"{100 * rate:.1f} %" for rate in success)
         yield (
             f"| {LABELS[planner]} | {cells[0]['parameters']:,} | {len(cells)} | {100 * mean(success):.1f} % | {each} "
@@ -96,11 +89,11 @@ def write_table(results: Results, commits: set[str]) -> None:
     lines = [
         "# The planners on 2D sorting",
         "",
-        "Written by `python -m benchmarks.planner_comparison` from the files in `benchmarks/results/planners/` "
+        "Written by `python -m benchmarks.planner_comparison` from the files in `benchmarks/results/paper/mini*/` "
         f"(code of {', '.join(sorted(commits))}). What each planner models is on [its own page](planners.md).",
         "",
-        f"Success and mean score are means over the last {LAST} evaluations of every seed, each on fresh starts that "
-        "are the same for all planners. Parameters are those of the network that is trained.",
+        "Success and mean score are means over the last evaluations of every seed, each on fresh starts that are the "
+        "same for all planners. Parameters are those of the networks that are trained.",
         "",
         f"![Success over training]({PLOT.relative_to(DOCS)})",
     ]
@@ -110,7 +103,9 @@ def write_table(results: Results, commits: set[str]) -> None:
             "",
             f"## {panel.title}",
             "",
-            f"{cell['curve'][-1]['step']} steps of {cell['batch_size']} samples, {cell['starts']} starts a point.",
+            f"{cell['steps']} steps of {cell['batch_size']} samples, {cell['demonstrations']} demonstrations, "
+            f"{cell['network_calls_per_plan']} network calls for a plan (and level); {cell['starts']} starts an "
+            f"evaluation, the last {cell['average_last']} count.",
             "",
             *table(planners),
         ]
@@ -130,8 +125,8 @@ def write_plot(results: Results) -> None:
     size = (4.5 * columns, 3 * rows)
     figure, axes = plt.subplots(rows, columns, figsize=size, sharey=True, squeeze=False, layout="constrained")
     for axis, (panel, planners) in zip(axes.flat, results.items(), strict=False):
-        for planner in sorted(planners, key=PLANNERS.index):
-            colour = f"C{PLANNERS.index(planner)}"
+        for planner in sorted(planners, key=METHODS.index):
+            colour = f"C{METHODS.index(planner)}"
             steps = [point["step"] for point in planners[planner][0]["curve"]]
             rates = list(zip(*([p["success_rate"] for p in cell["curve"]] for cell in planners[planner]), strict=True))
             axis.plot(steps, [mean(seeds) for seeds in rates], color=colour, label=LABELS[planner])

@@ -9,13 +9,13 @@ Records the config's dataset if it is not there, runs `hdp-train` and `lerobot-e
 
 import argparse
 import json
-import math
 import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
+from .evaluation import wilson_interval
 from .machine import describe_run
 
 RESULTS = Path(__file__).parent / "results"
@@ -27,14 +27,6 @@ def run(command: str, *arguments: str) -> float:
     start = time.perf_counter()
     subprocess.run([Path(sys.executable).with_name(command), *arguments], check=True)
     return time.perf_counter() - start
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % confidence interval of a success rate (Wilson 1927)."""
-    z, rate = 1.96, successes / trials
-    centre = rate + z * z / (2 * trials)
-    spread = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    return tuple(round((centre + sign * spread) / (1 + z * z / trials), 4) for sign in (-1, 1))
 
 
 def measure(config: Path, name: str, planner: str, episodes: int, seed: int, flags: list[str]) -> dict[str, Any]:

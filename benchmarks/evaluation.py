@@ -1,0 +1,181 @@
+"""Plans of a checkpoint, and what comes of them: what the benchmarks share that evaluate trained planners."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies import get_policy_class, make_pre_post_processors
+
+import lerobot_policy_hdp  # noqa: F401 (registers the policies and the tasks)
+from gym_hdp_tasks.block_sorting_2d import block_name
+from gym_hdp_tasks.open_loop import execute_plans
+from lerobot_hdp import PlanPrompt
+
+BATCH = 50
+"""Plans that are made at once."""
+Outcome = dict[str, Any]
+"""`is_success`, and what else is known of an executed plan."""
+
+
+@dataclass
+class Subject:
+    """A planner, and the starts that it plans for.
+
+    Attributes:
+        path: of its checkpoint.
+        policy, postprocessor: the planner.
+        gym_id, parameters: what makes its task.
+        seeds: of the starts.
+        observations: as the environment gives them.
+        inputs: the same, preprocessed.
+    """
+
+    path: Path
+    policy: Any
+    postprocessor: Any
+    gym_id: str
+    parameters: dict[str, Any]
+    seeds: range
+    observations: list[dict[str, np.ndarray]]
+    inputs: dict[str, torch.Tensor]
+
+    def make_env(self) -> gym.Env:
+        return gym.make(self.gym_id, disable_env_checker=True, **self.parameters)
+
+    def facts(self) -> dict[str, Any]:
+        """What a results file says about it."""
+        train = json.loads((self.path / "train_config.json").read_text())
+        steps = self.policy.config.num_inference_steps or self.policy.config.num_train_timesteps
+        return {
+            "planner": self.policy.config.type,
+            "task": self.gym_id.removeprefix("hdp/"),
+            "parameters": self.parameters,
+            "train_steps": train["steps"],
+            "train_seed": train["seed"],
+            "network_calls_per_plan": steps,
+            "starts": len(self.seeds),
+        }
+
+
+class Plans(NamedTuple):
+    """A plan for each start.
+
+    Attributes:
+        motions: (starts, horizon, D) in the task's units.
+        symbols: the symbolic plans in words; empty ones from a planner that models none.
+    """
+
+    motions: np.ndarray
+    symbols: list[list[str]]
+
+
+def load(
+    path: Path, starts: int, num_inference_steps: int | None = None, gym_id: str | None = None, first_seed: int = 0
+) -> Subject:
+    """Load a checkpoint and reset its task (or another one) to some seeds.
+
+    Args:
+        path: a `pretrained_model` folder.
+        starts: number of seeds. Demonstrations were recorded from seeds of 32 random bits.
+        num_inference_steps: network calls for a plan; None: as in the checkpoint.
+        gym_id: a task with the parameters of the one that the checkpoint was trained for.
+        first_seed: the others follow it.
+    """
+    config = PreTrainedConfig.from_pretrained(path)
+    policy = get_policy_class(config.type).from_pretrained(path)
+    if num_inference_steps:
+        policy.config.num_inference_steps = num_inference_steps
+    device = {"device_processor": {"device": policy.config.device}}
+    preprocessor, postprocessor = make_pre_post_processors(policy.config, path, preprocessor_overrides=device)
+    task = TrainPipelineConfig.from_pretrained(path).env.planning_task
+    gym_id = gym_id or task.gym_id
+    env = gym.make(gym_id, disable_env_checker=True, **task.parameters)
+    seeds = range(first_seed, first_seed + starts)
+    observations = [env.reset(seed=seed)[0] for seed in seeds]
+    names = {"observation.state": "agent_pos", "observation.environment_state": "environment_state"}
+    stacked = {key: torch.tensor(np.stack([o[name] for o in observations])) for key, name in names.items()}
+    inputs = {key: value for key, value in preprocessor(stacked).items() if key in names}
+    return Subject(path, policy, postprocessor, gym_id, task.parameters, seeds, observations, inputs)
+
+
+def make_plans(subject: Subject, prompts: Sequence[str] | torch.Tensor | None = None) -> Plans:
+    """A plan for each start, with its prompt, if any.
+
+    Args:
+        subject: the planner and the starts.
+        prompts: one for each start, as words or as token ids (starts, H_d).
+    """
+    torch.manual_seed(0)
+    motions, symbols = [], []
+    for first in range(0, len(subject.seeds), BATCH):
+        part = slice(first, first + BATCH)
+        prompt = None if prompts is None else prompts[part]
+        if isinstance(prompt, torch.Tensor):
+            prompt = PlanPrompt(token_ids=prompt.to(subject.policy.config.device))
+        plan = subject.policy.plan({key: value[part] for key, value in subject.inputs.items()}, prompt)
+        motions.append(subject.postprocessor(plan.actions))
+        symbols += [plan.symbols(index) for index in range(len(plan.actions))]
+    return Plans(torch.cat(motions).numpy(), symbols)
+
+
+def execute(subject: Subject, motions: np.ndarray, seeds: Sequence[int]) -> list[Outcome]:
+    """Carry plans out; in the plane, say which block the gripper took first."""
+    if "XArm" in subject.gym_id:
+        return execute_plans(subject.gym_id, seeds, motions, **subject.parameters)
+    env, outcomes = subject.make_env(), []
+    for seed, motion in zip(seeds, motions, strict=True):
+        env.reset(seed=seed)
+        first_block = None
+        for action in motion:
+            *_, info = env.step(action)
+            if first_block is None and env.unwrapped.held is not None:
+                first_block = block_name(env.unwrapped.held)
+        outcomes.append({**info, "first_block": first_block})
+    return outcomes
+
+
+def rate(hits: Sequence[bool]) -> dict[str, Any]:
+    """How often, with its 95 % interval (Wilson)."""
+    hits = [bool(hit) for hit in hits]
+    if not hits:
+        return {"rate": None, "of": 0}
+    return {"rate": round(np.mean(hits), 4), "interval_95": wilson_interval(sum(hits), len(hits)), "of": len(hits)}
+
+
+def evaluate(path: Path, starts: int, first_seed: int) -> dict[str, Any]:
+    """Success and mean score of a checkpoint, and of the failures how many had a valid symbolic plan.
+
+    Args:
+        path: a `pretrained_model` folder.
+        starts: fresh starts of the task that it was trained for.
+        first_seed: of the starts.
+    """
+    subject = load(path, starts, first_seed=first_seed)
+    plans = make_plans(subject)
+    outcomes = execute(subject, plans.motions, subject.seeds)
+    result = {
+        "success_rate": round(np.mean([outcome["is_success"] for outcome in outcomes]), 4),
+        "mean_score": round(np.mean([outcome["score"] for outcome in outcomes]), 4),
+    }
+    if subject.policy.symbol_process is not None:
+        check = subject.make_env().unwrapped.planning_task.check_plan
+        valid = [not check(*pair) for pair in zip(plans.symbols, subject.observations, strict=True)]
+        failed = [plan for plan, outcome in zip(valid, outcomes, strict=True) if not outcome["is_success"]]
+        result |= {"valid_plans": sum(valid), "failures_with_valid_plan": sum(failed), "failures": len(failed)}
+    return result
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """95 % confidence interval of a success rate (Wilson 1927)."""
+    z, rate = 1.96, successes / trials
+    centre = rate + z * z / (2 * trials)
+    spread = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
+    return tuple(round((centre + sign * spread) / (1 + z * z / trials), 4) for sign in (-1, 1))

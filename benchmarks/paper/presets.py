@@ -1,0 +1,159 @@
+"""What is trained for each preset, task and method: the cells of `python -m benchmarks.paper`."""
+
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+from ..cells import Cell
+
+METHODS = ("hdp", "diffuser", "joint_diffuser", "separate_diffuser", "hd", "chd")
+"""Policy types, in the order in which they are worth running."""
+HIERARCHICAL = ("hd", "chd")
+"""Two networks each, so that their size is reported and not matched."""
+ENVS: dict[str, dict[str, Any]] = {
+    "xarm_sorting": {"task": "XArmSorting-v0"},
+    "xarm_arrange_blocks": {"task": "XArmArrangeBlocks-v0"},
+    "xarm_tool_use": {"task": "XArmToolUse-v0"},
+    "block_sorting_2d_2_blocks": {"task": "BlockSorting2D-v0", "n_blocks": 2, "waypoints_per_pose": 1},
+    "block_sorting_2d_3_blocks": {"task": "BlockSorting2D-v0", "n_blocks": 3, "waypoints_per_pose": 1},
+    "block_sorting_2d_4_blocks": {"task": "BlockSorting2D-v0", "n_blocks": 4, "waypoints_per_pose": 1},
+}
+
+
+@dataclass(frozen=True)
+class Training:
+    """How the planners are trained for one task.
+
+    Attributes:
+        demonstrations: as many are recorded.
+        steps: of the optimiser.
+        batch_size: samples a step.
+        policy: options that differ from the preset's.
+    """
+
+    demonstrations: int
+    steps: int
+    batch_size: int
+    policy: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How all planners are trained and evaluated.
+
+    Attributes:
+        policy: options of all planners.
+        tasks: for each task its training.
+        evaluations, starts, average_last: see `Cell`.
+        hdp_policy: options of HDP, beside the others'.
+    """
+
+    policy: dict[str, Any]
+    tasks: dict[str, Training]
+    evaluations: int = 50
+    starts: int = 50
+    average_last: int = 10
+    hdp_policy: dict[str, Any] = field(default_factory=dict)
+
+
+def _steps(epochs: int, demonstrations: int, batch_size: int) -> int:
+    """Optimiser steps of the paper's epochs: each demonstration is seen once in one."""
+    return epochs * demonstrations // batch_size
+
+
+_MINI_2D = {"num_layers": 5, "width": 112, "num_inference_steps": 20}
+_MINI_XARM = {"num_layers": 4, "width": 128}
+_TASKS_2D = {
+    "block_sorting_2d_2_blocks": Training(200, steps=1000, batch_size=50, policy=_MINI_2D),
+    "block_sorting_2d_3_blocks": Training(200, steps=1500, batch_size=50, policy=_MINI_2D),
+    "block_sorting_2d_4_blocks": Training(200, steps=2500, batch_size=50, policy=_MINI_2D),
+}
+PRESETS: dict[str, Preset] = {
+    # The paper's hyperparameters and sampler: 100 network calls, weights averaged, the mean over 10 checkpoints.
+    "paper": Preset(
+        policy={"preset": "paper"},
+        tasks={
+            "xarm_sorting": Training(200, _steps(5_000, 200, 64), 64, {"symbolic_horizon": 108}),
+            "xarm_arrange_blocks": Training(4_000, _steps(5_000, 4_000, 64), 64),
+            "xarm_tool_use": Training(4_000, _steps(10_000, 4_000, 64), 64),
+        },
+    ),
+    # Ours: the paper's network and data, with our training targets and sampler, and far fewer steps.
+    "default": Preset(
+        policy={"preset": "default"},
+        tasks={
+            "xarm_sorting": Training(200, 15_000, 50),
+            "xarm_arrange_blocks": Training(4_000, 60_000, 64),
+            "xarm_tool_use": Training(4_000, 60_000, 64),
+        },
+    ),
+    # What two cores do in minutes a cell: a network of a tenth of the size.
+    "mini": Preset(
+        policy={"preset": "default", "dtype": "bfloat16"},
+        tasks={
+            **_TASKS_2D,
+            "xarm_sorting": Training(200, 3_000, 50, _MINI_XARM),
+            "xarm_arrange_blocks": Training(1_000, 4_000, 50, _MINI_XARM),
+            "xarm_tool_use": Training(1_000, 4_000, 50, _MINI_XARM),
+        },
+        evaluations=10,
+        starts=100,
+        average_last=3,
+    ),
+    # The same with the paper's noise prediction, its learning rate, and its weight of the symbols.
+    "mini_epsilon": Preset(
+        policy={"preset": "default", "dtype": "bfloat16", "prediction_type": "epsilon", "optimizer_lr": 5e-4},
+        tasks=_TASKS_2D,
+        evaluations=10,
+        starts=100,
+        average_last=3,
+        hdp_policy={"symbol_loss_weight": 1 / 30},
+    ),
+}
+TASKS = tuple(ENVS)
+
+
+def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
+    """The cell of a preset, a task, a method and a seed.
+
+    Raises:
+        KeyError: the preset has no such task.
+    """
+    preset = PRESETS[preset_name]
+    training = preset.tasks[task]
+    policy = {"type": method, **preset.policy, **training.policy}
+    if method == "hdp":
+        policy |= preset.hdp_policy
+    if method in ("diffuser", *HIERARCHICAL):
+        policy.pop("symbolic_horizon", None)  # they have no symbols
+    return Cell(
+        group=f"paper/{preset_name}",
+        name=f"{task}_{method}_seed{seed}",
+        env=ENVS[task],
+        demonstrations=training.demonstrations,
+        policy=policy,
+        steps=training.steps,
+        batch_size=training.batch_size,
+        seed=seed,
+        evaluations=preset.evaluations,
+        starts=preset.starts,
+        average_last=preset.average_last,
+        facts={"preset": preset_name, "task_name": task},
+    )
+
+
+def make_cells(presets: list[str], tasks: list[str], methods: list[str], seeds: list[int]) -> list[Cell]:
+    """All cells of some presets, tasks, methods and seeds, the ones most worth running first.
+
+    The first seed of everything comes before the second of anything; of a seed, HDP and Diffuser come first.
+    """
+
+    def worth(choice: tuple[int, str, str, str]) -> tuple[int, ...]:
+        seed, method, preset, task = choice
+        rank = METHODS.index(method)
+        if preset == "paper":
+            rank = max(rank, 1)  # after ours with HDP and Diffuser
+        return seed, rank, list(PRESETS).index(preset), TASKS.index(task)
+
+    choices = [choice for choice in product(seeds, methods, presets, tasks) if choice[3] in PRESETS[choice[2]].tasks]
+    return [make_cell(preset, task, method, seed) for seed, method, preset, task in sorted(choices, key=worth)]
