@@ -8,12 +8,12 @@ import json
 import math
 import os
 import shutil
-import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from lerobot.policies.factory import get_policy_class
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
 from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.modeling_hdp import HDPPolicy
+from lerobot_hdp.scripts import hdp_train
 
 from .evaluation import evaluate
 from .machine import describe_run
@@ -34,6 +35,8 @@ FIRST_EVALUATION_SEED = 1_000_000
 POLL_S = 2.0
 SHORTEST_TRAINING_MIN = 0.5
 """A training that the budget leaves less time for is not begun."""
+PROCESSES = get_context("forkserver")
+PROCESSES.set_forkserver_preload([__name__])  # LeRobot is imported once, not by every process
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ class Cell:
         """`finished`, the step where it stopped, or `missing`."""
         if self.result_file.exists():
             return "finished"
-        step = _last_step(self)
+        step = last_step(self.folder)
         return f"stopped after step {step} of {self.steps}" if step else "missing"
 
 
@@ -180,7 +183,7 @@ def run_cells(cells: list[Cell], processes: int = 1, budget_minutes: float | Non
         record_dataset(cell, num_workers=os.cpu_count() or 1)
     run_facts = describe_run()
     with ProcessPoolExecutor(
-        processes, mp_context=get_context("spawn"), initializer=_share_cores, initargs=(processes,)
+        processes, mp_context=PROCESSES, initializer=_share_cores, initargs=(processes,)
     ) as executor:
         futures = [executor.submit(run_cell, cell, run_facts, processes == 1, deadline) for cell in missing]
         for future in as_completed(futures):
@@ -207,47 +210,59 @@ def run_cell(cell: Cell, run_facts: dict[str, Any], evaluate_meanwhile: bool, de
         RuntimeError: `hdp-train` failed; names its log.
     """
     progress, training = Progress.load(cell), None
-    if _last_step(cell) < cell.steps:
+    if last_step(cell.folder) < cell.steps:
         minutes = None if deadline is None else (deadline - time.time()) / 60
         if minutes is not None and minutes < SHORTEST_TRAINING_MIN:
             return f"{cell.name}: {cell.state()}, no time left"
         training = start_training(cell, minutes)
     before, start = progress.train_s, time.time()
-    while training is not None and training.poll() is None:
+    while training is not None and training.is_alive():
         time.sleep(POLL_S)
         progress.train_s = before + time.time() - start
         if evaluate_meanwhile:
             evaluate_checkpoints(cell, progress)
         cell.folder.mkdir(parents=True, exist_ok=True)
         progress.save(cell)
-    if training is not None and training.returncode:
+    if training is not None and training.exitcode:
         raise RuntimeError(f"{cell.name}: hdp-train failed, see {cell.folder / 'train.log'}")
     evaluate_checkpoints(cell, progress)
-    if _last_step(cell) < cell.steps:
+    if last_step(cell.folder) < cell.steps:
         return f"{cell.name}: {cell.state()}"
     _write_json(cell.result_file, {"run": run_facts, "result": result_of(cell, progress)})
     return f"{cell.name}: success {progress.curve[-1]['success_rate']:.0%} in the end, {progress.train_s / 60:.1f} min"
 
 
-def start_training(cell: Cell, minutes: float | None) -> subprocess.Popen:
-    """Start or resume `hdp-train`, which writes to `train.log` in the cell's folder."""
+def start_training(cell: Cell, minutes: float | None) -> BaseProcess:
+    """Start or resume `hdp-train` in a process of its own, which writes to `train.log` in the cell's folder."""
     cell.folder.mkdir(parents=True, exist_ok=True)
     arguments = [] if minutes is None else [f"--max_train_minutes={minutes:.2f}"]
-    if _last_step(cell):
+    if last_step(cell.folder):
         arguments += ["--resume=true", f"--config_path={cell.last_checkpoint / 'train_config.json'}"]
     else:
         shutil.rmtree(cell.folder / "train", ignore_errors=True)
         config = cell.folder / "train_config.json"
         _write_json(config, cell.train_config())
         arguments += [f"--config_path={config}"]
-    with (cell.folder / "train.log").open("a") as log:
-        command = [sys.executable, "-m", "lerobot_hdp.scripts.hdp_train", *arguments]
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+    training = PROCESSES.Process(
+        target=_hdp_train, args=(arguments, cell.folder / "train.log", torch.get_num_threads())
+    )
+    training.start()
+    return training
+
+
+def _hdp_train(arguments: list[str], log: Path, threads: int) -> None:
+    """What the command `hdp-train` does, without its start-up time."""
+    with log.open("a") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    torch.set_num_threads(threads)
+    sys.argv = ["hdp-train", *arguments]
+    hdp_train.main()
 
 
 def evaluate_checkpoints(cell: Cell, progress: Progress) -> None:
     """Evaluate the checkpoints that are not in the learning curve yet, and delete all but the last one."""
-    last = _last_step(cell)
+    last = last_step(cell.folder)
     done = {point["step"] for point in progress.curve}
     for checkpoint in sorted(path for path in cell.checkpoints.glob("[0-9]*") if int(path.name) <= last):
         step = int(checkpoint.name)
@@ -287,9 +302,9 @@ def num_parameters(policy: HDPPolicy) -> int:
     return sum(parameter.numel() for parameter in policy.planner.parameters())
 
 
-def _last_step(cell: Cell) -> int:
-    """Step of the last complete checkpoint; 0 if there is none."""
-    last = cell.checkpoints / "last"
+def last_step(folder: Path) -> int:
+    """Step of the last complete checkpoint in a cell's folder; 0 if there is none."""
+    last = folder / "train" / "checkpoints" / "last"
     return int(last.resolve().name) if last.exists() else 0
 
 
@@ -303,6 +318,4 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 def _share_cores(processes: int) -> None:
     """Let each process, and the training that it starts, use its part of the cores."""
-    threads = max(1, (os.cpu_count() or 1) // processes)
-    os.environ["OMP_NUM_THREADS"] = str(threads)
-    torch.set_num_threads(threads)
+    torch.set_num_threads(max(1, (os.cpu_count() or 1) // processes))

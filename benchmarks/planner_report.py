@@ -112,14 +112,24 @@ def write_table(results: Results, commits: set[str]) -> None:
     TABLE.write_text("\n".join(lines) + "\n")
 
 
-def write_plot(results: Results) -> None:
-    """Draw success over optimiser steps: a line for each planner, a band between its seeds."""
+def use_svg() -> Any:
+    """`matplotlib.pyplot`, drawing to SVG files; the same results make the same file.
+
+    Raises:
+        ImportError: Matplotlib is not installed: it comes with the extra `benchmarks`.
+    """
     import matplotlib
 
     matplotlib.use("svg")
-    matplotlib.rcParams["svg.hashsalt"] = "planners"  # the same results make the same file
-    from matplotlib import pyplot as plt
+    matplotlib.rcParams["svg.hashsalt"] = "planners"
+    from matplotlib import pyplot
 
+    return pyplot
+
+
+def write_plot(results: Results) -> None:
+    """Draw success over optimiser steps: a line for each planner, a band between its seeds."""
+    plt = use_svg()
     columns = min(2, len(results))
     rows = -(-len(results) // columns)
     size = (4.5 * columns, 3 * rows)

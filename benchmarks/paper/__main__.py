@@ -2,16 +2,20 @@
 
     python -m benchmarks.paper --preset mini --tasks xarm_arrange_blocks --methods hdp diffuser --seeds 0 1 2
     python -m benchmarks.paper --list           # what is missing, in the order worth doing
+    python -m benchmarks.paper --report         # docs/results.md, from benchmarks/results/paper/
 
 A cell is one preset, task, method and seed: it records its demonstrations, trains with `hdp-train`, evaluates fresh
 starts at regular intervals, and writes `benchmarks/results/paper/<preset>/<cell>.json`. A finished cell is never run
-again, an interrupted one goes on.
+again, an interrupted one goes on. `--pack` and `--unpack` are for machines without a checkout, see packing.py.
 """
 
 import argparse
+from pathlib import Path
 
 from ..cells import run_cells
+from .packing import decompress, export, pack, unpack
 from .presets import METHODS, PRESETS, TASKS, make_cells
+from .report import write_report
 
 
 def main() -> None:
@@ -24,14 +28,32 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--budget_minutes", type=float, help="stop with checkpoints when it is spent")
     parser.add_argument("--processes", type=int, default=1, help="cells at a time, which share the cores")
-    parser.add_argument("--list", action="store_true", help="say what is finished and what is missing")
+    action = parser.add_mutually_exclusive_group()
+    action.add_argument("--list", action="store_true", help="say what is finished and what is missing")
+    action.add_argument("--report", action="store_true", help="write docs/results.md")
+    action.add_argument("--pack", type=Path, metavar="FOLDER", help="put what the missing cells need into a new folder")
+    action.add_argument("--unpack", type=Path, metavar="FOLDER", help="take over what was run there")
+    action.add_argument(
+        "--export", type=Path, metavar="FOLDER", help="write the finished cells' planners there, as small checkpoints"
+    )
     options = parser.parse_args()
 
     cells = make_cells(options.presets, options.tasks, options.methods, options.seeds)
     if options.list:
         for cell in cells:
             print(f"{cell.group.removeprefix('paper/') + '/' + cell.name:60} {cell.state()}")
+    elif options.report:
+        print(*write_report(), sep="\n")
+    elif options.pack:
+        pack([cell for cell in cells if cell.state() != "finished"], options.pack)
+    elif options.unpack:
+        unpack(options.unpack)
+    elif options.export:
+        for cell in cells:
+            if cell.state() == "finished":
+                export(cell.last_checkpoint, options.export / cell.name)
     else:
+        decompress()
         run_cells(cells, options.processes, options.budget_minutes)
 
 

@@ -1,0 +1,136 @@
+"""Carry cells to a machine that has neither a checkout nor a package registry, and their results back.
+
+    python -m benchmarks.paper --preset default --methods hdp --seeds 0 --pack cells
+    cd cells; PYTHONPATH=. python -m benchmarks.paper --preset default --methods hdp --seeds 0 --budget_minutes 9
+    python -m benchmarks.paper --unpack cells
+
+The first and the last command are for here, the second one for there. The folder holds the code, the demonstrations
+(compressed; they are unpacked where cells first run) and the checkpoints of cells that were stopped. LeRobot and its
+dependencies must be installed there, this package need not be.
+"""
+
+import shutil
+import subprocess
+import tarfile
+from collections.abc import Sequence
+from importlib.metadata import distribution
+from pathlib import Path
+
+from huggingface_hub import save_torch_state_dict
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class
+from safetensors.torch import load_file, save_file
+
+from ..cells import DATASETS, RESULTS, WORK, Cell, last_step, record_dataset
+
+CODE = ("benchmarks/*.py", "benchmarks/paper", "dataset_tools", "gym_hdp_tasks", "lerobot_hdp", "lerobot_policy_hdp.py")
+METADATA = ("METADATA", "entry_points.txt")
+MAX_FILE_SIZE = "15MB"
+WEIGHTS = "model.safetensors"
+ARCHIVE = "{}.tar.xz"
+
+
+def pack(cells: Sequence[Cell], folder: Path) -> None:
+    """Put all that some cells need into a folder; record their demonstrations first, if they are not there.
+
+    Raises:
+        FileExistsError: the folder is there already.
+    """
+    folder.mkdir(parents=True)
+    repository = Path(__file__).parents[2]
+    files = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", *CODE],
+        cwd=repository,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(repository / file, folder / file)
+    _pack_metadata(folder)
+    for cell in {cell.dataset_root: cell for cell in cells}.values():
+        record_dataset(cell, num_workers=2)
+        _compress(cell.dataset_root, folder)
+    for cell in cells:
+        if cell.last_checkpoint.exists():
+            _compress(cell.folder, folder)
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    print(f"{folder}: {len(cells)} cells, {size / 2**20:.1f} MiB")
+
+
+def _pack_metadata(folder: Path) -> None:
+    """What tells LeRobot, by the distribution's name, that there is a policy plugin on the path."""
+    installed = distribution("lerobot_policy_hdp")
+    target = folder / f"lerobot_policy_hdp-{installed.version}.dist-info"
+    target.mkdir()
+    for name in METADATA:
+        (target / name).write_text(installed.read_text(name) or "")
+
+
+def _compress(source: Path, folder: Path) -> None:
+    """Add a folder of `outputs/`, as an archive in its place."""
+    archive = folder / ARCHIVE.format(source)
+    archive.parent.mkdir(parents=True, exist_ok=True)
+    with tarfile.open(archive, "w:xz") as file:
+        file.add(source.resolve(), source.name)
+
+
+def decompress() -> None:
+    """Unpack the archives that lie where their folders should be, below the working folder."""
+    for root in (DATASETS, WORK):
+        for archive in root.rglob(ARCHIVE.format("*")):
+            with tarfile.open(archive) as file:
+                file.extractall(archive.parent, filter="data")
+            archive.unlink()
+
+
+def unpack(folder: Path) -> None:
+    """Take over the results of a folder, and the cells that went further there than here."""
+    for progress in (folder / WORK).rglob("progress.json"):
+        there = progress.parent
+        here = WORK / there.relative_to(folder / WORK)
+        if last_step(there) > last_step(here):
+            shutil.rmtree(here, ignore_errors=True)
+            shutil.copytree(there, here, symlinks=True)
+            print(here)
+    results = folder / "benchmarks" / "results"
+    for file in results.rglob("*.json"):
+        own = RESULTS / file.relative_to(results)
+        if not own.exists():
+            own.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(file, own)
+            print(own)
+
+
+def export(checkpoint: Path, target: Path, max_file_size: str = MAX_FILE_SIZE) -> None:
+    """Write a checkpoint that only plans: the averaged weights, as bfloat16, in files of a limited size.
+
+    Args:
+        checkpoint: a `pretrained_model` folder.
+        target: a new folder, of the same form if one file is enough; else `join_files` brings it into that form.
+        max_file_size: e.g. `15MB`.
+    """
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    policy = get_policy_class(config.type).from_pretrained(checkpoint)
+    if policy.ema is not None:
+        policy.planner.load_state_dict(policy.ema.module.state_dict())
+        policy.ema, policy.config.ema_max_decay = None, 0.0
+    target.mkdir(parents=True)
+    for path in checkpoint.iterdir():
+        if path.name != WEIGHTS:
+            shutil.copy(path, target)
+    policy.config.save_pretrained(target)
+    weights = {
+        name: value.bfloat16() if value.is_floating_point() else value for name, value in policy.state_dict().items()
+    }
+    save_torch_state_dict(weights, target, max_shard_size=max_file_size)
+
+
+def join_files(folder: Path) -> None:
+    """Make one file of the weights that `export` wrote as several."""
+    parts = sorted(folder.glob("model-*.safetensors"))
+    if parts:
+        save_file({name: value for part in parts for name, value in load_file(part).items()}, folder / WEIGHTS)
+        for path in [*parts, folder / f"{WEIGHTS}.index.json"]:
+            path.unlink()
