@@ -16,12 +16,6 @@ PAGES = {
 HEADING = "## Measured\n"
 
 
-COUPLED_SEEDS = """\
-These runs seeded the expert like the start, so that its choices followed from it; the script since gives it
-a seed of its own, and the runs are to be repeated.
-"""
-
-
 def load(name: str) -> dict:
     """A results file; empty when it is not there."""
     path = RESULTS / f"{name}.json"
@@ -45,15 +39,13 @@ def expert_table(task: str) -> str:
         rows["recorded episodes that replay to the recorded score"] = (
             f"{replay['same_score']} of {replay['num_episodes']}"
         )
-    # Results without the facts of their run are from before the expert had a seed of its own.
-    caveat = "" if "run" in own and "run" in menagerie else f"{COUPLED_SEEDS}\n"
     lines = [f"| {task} | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())]
     commands = [
         f"python -m benchmarks.experts --tasks {own['task']} --num_episodes {own['num_episodes']}",
         *(["python -m benchmarks.replay"] if replay else []),
     ]
     table = "\n".join(lines)
-    return f"{machine(own)}{caveat}{table}\n\n{', '.join(f'`{command}`' for command in commands)}\n"
+    return f"{machine(own)}{table}\n\n{', '.join(f'`{command}`' for command in commands)}\n"
 
 
 def successes(result: dict) -> str:
@@ -63,8 +55,6 @@ def successes(result: dict) -> str:
 
 def machine(result: dict) -> str:
     """Where a result comes from, as a paragraph."""
-    if "run" not in result:
-        return "The figures are from two cores that a training run shared.\n\n"
     run = result["run"]
     return f"Measured on {run['cores']} cores ({run['cpu']}) at commit {run['git_commit']}.\n\n"
 

@@ -53,7 +53,7 @@ def score_plans(
     if symbol_process and symbols:
         prediction = denoise(motion, hidden, 0 * one, one)
         assert prediction.symbols is not None
-        loss += SYMBOL_WEIGHT * symbol_process.loss(prediction.symbols, symbols)
+        loss += SYMBOL_WEIGHT * symbol_process.cross_entropy(prediction.symbols, symbols)
     return -loss
 
 

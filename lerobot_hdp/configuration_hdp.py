@@ -1,5 +1,6 @@
 """Everything that can be set about the planner."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -10,6 +11,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
 
 from .encoders import object_sizes
+from .processes.masked import MASK_SCHEDULES
 from .prompt import encode_prompt
 from .vocabulary import Vocabulary
 
@@ -78,6 +80,8 @@ class HDPConfig(PreTrainedConfig):
             `v_prediction`.
         symbol_loss_weight: lambda, weight of the symbols' loss beside the motion's. The paper's 1/30 balances it
             against the error of the noise; that of the clean motion is about ten times smaller.
+        mask_schedule: how often training draws each level of masking: `linear`, all alike, or `cosine`, high ones more
+            often and with less weight.
         ema_power, ema_max_decay: the weights that plan are an exponential moving average with the decay
             min(1 - (1 + update)^-ema_power, ema_max_decay), as in Diffusion Policy. `ema_max_decay` 0 switches it off.
 
@@ -122,6 +126,7 @@ class HDPConfig(PreTrainedConfig):
     num_train_timesteps: int = 100
     prediction_type: str | None = None
     symbol_loss_weight: float | None = None
+    mask_schedule: str = "linear"
     ema_power: float = 0.75
     ema_max_decay: float = 0.9999
 
@@ -162,6 +167,7 @@ class HDPConfig(PreTrainedConfig):
         _check_choice("plan_from", self.plan_from, ["episode_start", "any_frame"])
         _check_choice("prediction_type", self.prediction_type, ["epsilon", "sample", "v_prediction"])
         _check_choice("sampler", self.sampler, SAMPLERS)
+        _check_choice("mask_schedule", self.mask_schedule, MASK_SCHEDULES)
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
@@ -278,6 +284,6 @@ class HDPConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
 
-def _check_choice(name: str, value: Any, choices: list[str]) -> None:
+def _check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
     if value not in choices:
         raise ParsingError(f"{name} must be one of {choices}, got {value!r}")

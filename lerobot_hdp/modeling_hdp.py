@@ -379,7 +379,7 @@ def make_processes(config: HDPConfig) -> tuple[GaussianProcess, SymbolProcess | 
     match config.symbol_process:
         case "masked":
             threshold = config.confidence_threshold if config.sampler == "confidence" else None
-            return motion, MaskedProcess(len(config.vocabulary), threshold)
+            return motion, MaskedProcess(len(config.vocabulary), threshold, config.mask_schedule)
         case "gaussian":
             return motion, GaussianSymbolProcess(len(config.vocabulary), *gaussian)
         case _:

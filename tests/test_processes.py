@@ -116,6 +116,19 @@ class TestMaskedProcess:
         loss = process.loss(logits, Corrupted(value, clean, torch.tensor([0.4])))
         torch.testing.assert_close(loss, expected[None])
 
+    def test_the_mean_loss_does_not_depend_on_the_schedule(self):
+        # A denoiser that is less sure the more is masked: cross-entropy 1 + k at every masked position.
+        clean, means = torch.zeros(200_000, 4, dtype=torch.int64), []
+        for schedule in ("linear", "cosine"):
+            process = MaskedProcess(2, schedule=schedule)
+            generator = torch.Generator().manual_seed(0)
+            level = process.sample_level(len(clean), clean.device, generator)
+            corrupted = process.corrupt(clean, level, generator)
+            logits = torch.stack([torch.zeros_like(level), torch.log(torch.expm1(1 + level))], dim=-1)
+            means.append(process.loss(logits[:, None].expand(-1, 4, -1), corrupted).mean().item())
+        assert means[0] == pytest.approx(4 * 1.5, rel=0.01)
+        assert means[1] == pytest.approx(means[0], rel=0.01)
+
     def test_masked_tokens_are_revealed_with_the_probability_of_eq_6(self):
         process = MaskedProcess(vocabulary_size=4)
         value = process.prior((2000, 20), torch.device("cpu"))

@@ -10,6 +10,10 @@ Each token is masked independently with probability k, so that alpha(k) = 1 - k:
 Eq. 6 draws the tokens of one step independently of each other, so that few steps make plans that contradict themselves.
 With a confidence threshold, a step reveals only what follows from what is there already: tokens whose drawn value is
 more probable than the threshold, and the surest one in any case (parallel decoding of Wu et al. 2025, "Fast-dLLM").
+
+A schedule k(u) of time u, uniform in (0, 1], is what training draws k from. The loss stays the same integral (MD4,
+section 3): the weight of Eq. 5 becomes k'(u) / k, which is 1 / k with the linear schedule k = u, and
+pi/2 sqrt(1 - k^2) / k with MD4's cosine schedule k = cos(pi/2 (1 - u)).
 """
 
 import math
@@ -20,6 +24,7 @@ from torch import Generator, Tensor
 
 from .base import Corrupted, expand_to
 
+MASK_SCHEDULES = ("linear", "cosine")
 MIN_LEVEL = 1e-3
 """Training keeps k off 0, where the weight 1 / k has no bound."""
 
@@ -30,10 +35,12 @@ class MaskedProcess:
     Args:
         vocabulary_size: m, the number of symbols; the mask e_m has the id m.
         confidence_threshold: reveal tokens by their probability; None: by Eq. 6.
+        schedule: `linear` or `cosine`, how often training draws each level.
     """
 
-    def __init__(self, vocabulary_size: int, confidence_threshold: float | None = None):
+    def __init__(self, vocabulary_size: int, confidence_threshold: float | None = None, schedule: str = "linear"):
         self.confidence_threshold = confidence_threshold
+        self.schedule = schedule
         self.vocabulary_size = vocabulary_size
         self.mask_id = vocabulary_size
         self.num_states = vocabulary_size + 1
@@ -42,6 +49,8 @@ class MaskedProcess:
         """Low-discrepancy sampling (Kingma et al. 2021): one level in each of B equal parts of (0, 1]."""
         offsets = torch.randperm(batch_size, device=device, generator=generator)
         uniform = (torch.rand(1, device=device, generator=generator) + offsets) / batch_size
+        if self.schedule == "cosine":
+            uniform = torch.sin(math.pi / 2 * uniform)
         return MIN_LEVEL + (1 - MIN_LEVEL) * uniform
 
     def corrupt(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Corrupted:
@@ -50,14 +59,19 @@ class MaskedProcess:
         return Corrupted(value=clean.masked_fill(masked, self.mask_id), target=clean, level=level)
 
     def loss(self, prediction: Tensor, corrupted: Corrupted) -> Tensor:
-        """Weighted cross-entropy of each sample, summed over its masked positions (Eq. 5): (B,).
+        """Weighted cross-entropy of each sample (Eq. 5): (B,).
 
         Args:
             prediction: (B, H, m) logits.
         """
-        cross_entropy = F.cross_entropy(prediction.float().transpose(1, 2), corrupted.target, reduction="none")
-        masked = corrupted.value == self.mask_id
-        return (cross_entropy * masked).sum(dim=1) / corrupted.level
+        k = corrupted.level
+        slope = math.pi / 2 * (1 - k.square()).clamp(min=0).sqrt() if self.schedule == "cosine" else 1.0  # k'(u)
+        return slope / k * self.cross_entropy(prediction, corrupted)
+
+    def cross_entropy(self, prediction: Tensor, corrupted: Corrupted) -> Tensor:
+        """Sum over the masked positions of each sample: (B,). For its arguments see `loss`."""
+        each = F.cross_entropy(prediction.float().transpose(1, 2), corrupted.target, reduction="none")
+        return (each * (corrupted.value == self.mask_id)).sum(dim=1)
 
     def prior(self, shape: tuple[int, ...], device: torch.device, generator: Generator | None = None) -> Tensor:
         return torch.full(shape, self.mask_id, dtype=torch.int64, device=device)

@@ -1,0 +1,16 @@
+"""The checkpoints that come with the repository do their task."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.evaluation import evaluate
+
+from .conftest import REPOSITORY
+
+CHECKPOINTS = sorted(path.parent for path in (REPOSITORY / "checkpoints").glob("*/config.json"))
+
+
+@pytest.mark.parametrize("checkpoint", CHECKPOINTS, ids=lambda path: path.name)
+def test_a_checkpoint_succeeds_on_fresh_starts(checkpoint: Path):
+    assert evaluate(checkpoint, starts=20, first_seed=5_000)["success_rate"] >= 0.85
