@@ -8,18 +8,17 @@ A cell (see cells.py) is one variant of the `mini` preset's HDP, trained with on
 """
 
 import argparse
-import json
 from collections import defaultdict
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from .cells import Cell, run_cells
+from .cells import Cell, read_result, run_cells
+from .pages import DOCS, markdown_table
 from .paper.presets import make_cell
 
-PAGE = Path(__file__).parents[1] / "docs" / "ablations.md"
+PAGE = DOCS / "ablations.md"
 STEPS = 1500
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -55,8 +54,8 @@ def write_page(cells: list[Cell]) -> None:
     """The table of all finished cells."""
     scores: dict[tuple[str, int], list[float]] = defaultdict(list)
     for cell in cells:
-        if cell.result_file.exists():
-            result = json.loads(cell.result_file.read_text())["result"]
+        if content := read_result(cell):
+            result = content["result"]
             rates = [point["success_rate"] for point in result["curve"][-cell.average_last :]]
             scores[result["variant"], result["n_blocks"]].append(100 * mean(rates))
     blocks, cell = sorted({cell.facts["n_blocks"] for cell in cells}), cells[0]
@@ -67,10 +66,11 @@ def write_page(cells: list[Cell]) -> None:
         f"preset changed at a time. 2D sorting, {cell.demonstrations} demonstrations, {cell.policy['num_layers']} "
         f"layers of width {cell.policy['width']}. `python -m benchmarks.ablations`\n\n"
     )
-    page += f"| setting | {' | '.join(f'{n} blocks' for n in blocks)} |\n|---|{'---|' * len(blocks)}\n"
-    for variant in VARIANTS:
-        row = [", ".join(f"{score:.0f}" for score in scores[variant, n]) or "not run" for n in blocks]
-        page += f"| `{variant}` | {' | '.join(row)} |\n"
+    rows = [
+        [f"`{variant}`", *(", ".join(f"{score:.0f}" for score in scores[variant, n]) or "not run" for n in blocks)]
+        for variant in VARIANTS
+    ]
+    page += markdown_table(["setting", *(f"{n} blocks" for n in blocks)], rows)
     PAGE.write_text(page)
 
 

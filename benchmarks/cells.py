@@ -1,24 +1,30 @@
 """Cells: one planner, trained once with `hdp-train` and evaluated along the way. What is finished is never done again.
 
 A cell's figures go to `benchmarks/results/<group>/<cell>.json`, its checkpoints, its log and what is known so far to
-`outputs/cells/<group>/<cell>/`. An interrupted cell goes on from its last checkpoint.
+`outputs/cells/<group>/<cell>/`. An interrupted cell goes on from its last checkpoint, whenever it was interrupted.
 """
 
+import fcntl
 import json
 import math
 import os
 import shutil
 import sys
+import threading
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 import torch
 from lerobot.policies.factory import get_policy_class
+from lerobot.scripts import lerobot_train
 
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
 from gym_hdp_tasks.env_config import HDPEnv
@@ -32,11 +38,15 @@ RESULTS = Path(__file__).parent / "results"
 WORK = Path("outputs/cells")
 DATASETS = Path("outputs/datasets")
 FIRST_EVALUATION_SEED = 1_000_000
-POLL_S = 2.0
-SHORTEST_TRAINING_MIN = 0.5
+POLL_S = 1.0
+SHORTEST_TRAINING_S = 30.0
 """A training that the budget leaves less time for is not begun."""
+CORES_TO_EVALUATE_MEANWHILE = 4
+"""As many must belong to a cell for it to be evaluated while it trains; with fewer, evaluation would slow training."""
+TRAIN_S = "train_s.json"
+"""In a checkpoint's folder, written last: the seconds of training up to it. A checkpoint without it is incomplete."""
 PROCESSES = get_context("forkserver")
-PROCESSES.set_forkserver_preload([__name__])  # LeRobot is imported once, not by every process
+PROCESSES.set_forkserver_preload([__name__])  # so that LeRobot is imported once, not by every training
 
 
 @dataclass(frozen=True)
@@ -78,13 +88,16 @@ class Cell:
         return WORK / self.group / self.name
 
     @property
-    def checkpoints(self) -> Path:
-        return self.folder / "train" / "checkpoints"
+    def last_checkpoint(self) -> Path | None:
+        """The `pretrained_model` folder of the last checkpoint, if there is one; it stays when the cell is finished."""
+        complete = complete_checkpoints(self.folder)
+        return complete[-1] / "pretrained_model" if complete else None
 
     @property
-    def last_checkpoint(self) -> Path:
-        """The `pretrained_model` folder of the last checkpoint; it stays when the cell is finished."""
-        return self.checkpoints / "last" / "pretrained_model"
+    def last_step(self) -> int:
+        """Optimiser steps up to the last checkpoint."""
+        complete = complete_checkpoints(self.folder)
+        return int(complete[-1].name) if complete else 0
 
     @property
     def env_config(self) -> HDPEnv:
@@ -92,12 +105,19 @@ class Cell:
 
     @property
     def dataset_root(self) -> Path:
-        return DATASETS / f"{dataset_name(self.env)}_{self.demonstrations}"
+        task, *parameters = self.env.items()
+        parts = [task[1].removesuffix("-v0"), *(f"{name}_{value}" for name, value in parameters)]
+        return DATASETS / "_".join([*parts, f"{self.demonstrations}_episodes"])
 
     @property
     def evaluate_every(self) -> int:
         """Optimiser steps between two evaluations. There may be fewer before the last one."""
         return math.ceil(self.steps / self.evaluations)
+
+    @property
+    def samples(self) -> int:
+        """Demonstrations seen in training, with repetition: LeRobot's last batch of an epoch is smaller."""
+        return self.steps * self.demonstrations // math.ceil(self.demonstrations / self.batch_size)
 
     def train_config(self) -> dict[str, Any]:
         """For `hdp-train --config_path`."""
@@ -120,22 +140,43 @@ class Cell:
         }
 
     def state(self) -> str:
-        """`finished`, the step where it stopped, or `missing`."""
+        """`finished`, what is left to do, or `missing`."""
         if self.result_file.exists():
             return "finished"
-        step = last_step(self.folder)
-        return f"stopped after step {step} of {self.steps}" if step else "missing"
+        if self.last_step == self.steps:
+            return "trained, not yet evaluated"
+        return f"trained {self.last_step} steps of {self.steps}" if self.last_step else "missing"
+
+    def check_result(self, result: dict[str, Any]) -> None:
+        """Refuse a result that another description of this cell has made.
+
+        Raises:
+            ValueError: it was trained or evaluated otherwise than this cell says.
+        """
+        for name in ("demonstrations", "steps", "batch_size", "starts", "average_last", "policy"):
+            if result[name] != getattr(self, name):
+                raise ValueError(
+                    f"{self.result_file} was made with {name}={result[name]}, not {getattr(self, name)}: delete it, or "
+                    "put the old setting back"
+                )
 
 
-def dataset_name(env: dict[str, Any]) -> str:
-    """`xarm_sorting`, `block_sorting_2d_3_blocks`, ...: what the task's train config in `configs/` is called."""
-    name = {
-        "BlockSorting2D-v0": "block_sorting_2d",
-        "XArmSorting-v0": "xarm_sorting",
-        "XArmArrangeBlocks-v0": "xarm_arrange_blocks",
-        "XArmToolUse-v0": "xarm_tool_use",
-    }[env["task"]]
-    return f"{name}_{env['n_blocks']}_blocks" if "n_blocks" in env else name
+def read_result(cell: Cell) -> dict[str, Any] | None:
+    """The content of a finished cell's file: `run` and `result`; None if there is none.
+
+    Raises:
+        ValueError: see `Cell.check_result`.
+    """
+    if not cell.result_file.exists():
+        return None
+    content = json.loads(cell.result_file.read_text())
+    cell.check_result(content["result"])
+    return content
+
+
+def complete_checkpoints(folder: Path) -> list[Path]:
+    """The complete checkpoints in a cell's folder, by their step."""
+    return sorted(path.parent for path in folder.glob(f"train/checkpoints/[0-9]*/{TRAIN_S}"))
 
 
 @dataclass
@@ -143,12 +184,12 @@ class Progress:
     """What is known of a cell that is not finished.
 
     Attributes:
-        train_s: seconds in `hdp-train`, its start and its checkpoints included.
         curve: the evaluations so far.
+        runs: of `describe_run`, for each time that the training was started.
     """
 
-    train_s: float = 0.0
     curve: list[dict[str, Any]] = field(default_factory=list)
+    runs: list[dict[str, Any]] = field(default_factory=list)
 
     @classmethod
     def load(cls, cell: Cell) -> "Progress":
@@ -159,11 +200,15 @@ class Progress:
         _write_json(cell.folder / "progress.json", asdict(self))
 
 
-def record_dataset(cell: Cell, num_workers: int) -> None:
-    """Record a cell's demonstrations, if they are not there."""
-    if not (cell.dataset_root / "meta" / "episodes").exists():
-        config = RecordDatasetConfig(f"local/{cell.dataset_root.name}", cell.dataset_root, cell.demonstrations)
-        record(RecordConfig(config, cell.env_config, num_workers=num_workers, resume=True))
+class Deadline:
+    """When a budget is spent."""
+
+    def __init__(self, budget_minutes: float | None):
+        self.at = math.inf if budget_minutes is None else time.monotonic() + 60 * budget_minutes
+
+    @property
+    def seconds_left(self) -> float:
+        return self.at - time.monotonic()
 
 
 def run_cells(cells: list[Cell], processes: int = 1, budget_minutes: float | None = None) -> None:
@@ -171,113 +216,175 @@ def run_cells(cells: list[Cell], processes: int = 1, budget_minutes: float | Non
 
     Args:
         cells: to run.
-        processes: cells at a time; they share the cores. With one, a cell is evaluated while its training goes on.
-        budget_minutes: cells are stopped with a checkpoint when it is spent, and no more are begun.
+        processes: cells at a time; they share the cores.
+        budget_minutes: when it is spent, trainings stop with a checkpoint, and nothing more is begun.
 
     Raises:
         SystemExit: a cell failed; the others have been run.
     """
-    deadline = None if budget_minutes is None else time.time() + 60 * budget_minutes
+    deadline, threads = Deadline(budget_minutes), max(1, (os.cpu_count() or 1) // processes)
     missing = [cell for cell in cells if not cell.result_file.exists()]
     for cell in missing:
-        record_dataset(cell, num_workers=os.cpu_count() or 1)
-    run_facts = describe_run()
-    with ProcessPoolExecutor(
-        processes, mp_context=PROCESSES, initializer=_share_cores, initargs=(processes,)
-    ) as executor:
-        futures = [executor.submit(run_cell, cell, run_facts, processes == 1, deadline) for cell in missing]
-        for future in as_completed(futures):
-            print(future.exception() or future.result(), flush=True)
-    failures = [str(future.exception()) for future in futures if future.exception()]
-    if failures:
-        raise SystemExit("\n".join(["Some cells failed; call again to go on with them:", *failures]))
+        if deadline.seconds_left > SHORTEST_TRAINING_S:
+            record_dataset(cell, num_workers=os.cpu_count() or 1)
+    failed = []
+    with ThreadPoolExecutor(processes) as executor:
+        futures = {executor.submit(run_cell, cell, threads, deadline): cell for cell in missing}
+        try:
+            for future in as_completed(futures):
+                if error := future.exception():
+                    failed.append(futures[future].name)
+                    traceback.print_exception(error)
+                else:
+                    print(future.result(), flush=True)
+        except BaseException:  # Ctrl-C, above all
+            executor.shutdown(wait=False, cancel_futures=True)
+            for child in PROCESSES.active_children():
+                child.terminate()
+            raise
+    if failed:
+        raise SystemExit(f"failed, see above: {', '.join(failed)}. Call again to go on with them.")
 
 
-def run_cell(cell: Cell, run_facts: dict[str, Any], evaluate_meanwhile: bool, deadline: float | None) -> str:
+def run_cell(cell: Cell, threads: int = 1, deadline: Deadline | None = None) -> str:
     """Train and evaluate a cell from where it stopped; write its result if it comes to an end.
 
     Args:
         cell: to run.
-        run_facts: of `describe_run`.
-        evaluate_meanwhile: evaluate checkpoints while the training goes on, not after it.
-        deadline: on `time.time()`'s clock, when the training stops with a checkpoint. Checkpoints that are there are
-            evaluated in any case.
+        threads: of PyTorch, for training and for evaluation.
+        deadline: see `run_cells`.
 
     Returns:
         One line that says how it went.
 
     Raises:
-        RuntimeError: `hdp-train` failed; names its log.
+        RuntimeError: the training or an evaluation failed; names its log. Or another process runs this cell.
+        ValueError: the cell was begun with other settings.
     """
-    progress, training = Progress.load(cell), None
-    if last_step(cell.folder) < cell.steps:
-        minutes = None if deadline is None else (deadline - time.time()) / 60
-        if minutes is not None and minutes < SHORTEST_TRAINING_MIN:
-            return f"{cell.name}: {cell.state()}, no time left"
-        training = start_training(cell, minutes)
-    before, start = progress.train_s, time.time()
-    while training is not None and training.is_alive():
-        time.sleep(POLL_S)
-        progress.train_s = before + time.time() - start
-        if evaluate_meanwhile:
-            evaluate_checkpoints(cell, progress)
-        cell.folder.mkdir(parents=True, exist_ok=True)
-        progress.save(cell)
-    if training is not None and training.exitcode:
-        raise RuntimeError(f"{cell.name}: hdp-train failed, see {cell.folder / 'train.log'}")
-    evaluate_checkpoints(cell, progress)
-    if last_step(cell.folder) < cell.steps:
-        return f"{cell.name}: {cell.state()}"
-    _write_json(cell.result_file, {"run": run_facts, "result": result_of(cell, progress)})
-    return f"{cell.name}: success {progress.curve[-1]['success_rate']:.0%} in the end, {progress.train_s / 60:.1f} min"
-
-
-def start_training(cell: Cell, minutes: float | None) -> BaseProcess:
-    """Start or resume `hdp-train` in a process of its own, which writes to `train.log` in the cell's folder."""
+    deadline = deadline or Deadline(None)
     cell.folder.mkdir(parents=True, exist_ok=True)
-    arguments = [] if minutes is None else [f"--max_train_minutes={minutes:.2f}"]
-    if last_step(cell.folder):
-        arguments += ["--resume=true", f"--config_path={cell.last_checkpoint / 'train_config.json'}"]
+    with _lock(cell.folder / "lock"):
+        if cell.last_step < cell.steps:
+            if deadline.seconds_left < SHORTEST_TRAINING_S:
+                return f"{cell.name}: {cell.state()}, no time left"
+            train(cell, threads, deadline)
+        evaluate_checkpoints(cell, threads, deadline)
+        progress = Progress.load(cell)
+        if [point["step"] for point in progress.curve][-1:] != [cell.steps]:
+            return f"{cell.name}: {cell.state()}, out of time"
+        *earlier, last = progress.runs
+        result = result_of(cell, progress)
+        _write_json(cell.result_file, {"run": last, "earlier_runs": earlier, "result": result})
+    return f"{cell.name}: success {progress.curve[-1]['success_rate']:.0%} in the end, {result['train_s'] / 60:.1f} min"
+
+
+def train(cell: Cell, threads: int, deadline: Deadline) -> None:
+    """Run `hdp-train` from the last checkpoint on, with its output in `train.log` in the cell's folder.
+
+    It ends at the deadline, with a checkpoint. Where there are cores for it, checkpoints are evaluated meanwhile.
+    """
+    training = start_training(cell, threads, deadline)
+    evaluate_meanwhile = threads >= CORES_TO_EVALUATE_MEANWHILE
+    try:
+        while training.is_alive():
+            time.sleep(POLL_S)
+            for checkpoint in complete_checkpoints(cell.folder)[:-1]:
+                shutil.rmtree(checkpoint / "training_state", ignore_errors=True)
+            if evaluate_meanwhile:
+                evaluate_checkpoints(cell, threads, deadline)
+        if training.exitcode:
+            raise RuntimeError(f"{cell.name}: hdp-train failed, see {cell.folder / 'train.log'}")
+    finally:
+        training.terminate()
+        training.join()
+
+
+def start_training(cell: Cell, threads: int, deadline: Deadline) -> BaseProcess:
+    """Start or resume `hdp-train` in a process of its own.
+
+    Raises:
+        ValueError: the cell was begun with other settings.
+    """
+    config_file, config = cell.folder / "train_config.json", cell.train_config()
+    arguments, train_s = [], 0.0
+    if last := cell.last_checkpoint:
+        if json.loads(config_file.read_text()) != config:
+            raise ValueError(f"{cell.folder} was begun with other settings: delete it to begin again")
+        train_s = json.loads((last.parent / TRAIN_S).read_text())
+        arguments = ["--resume=true", f"--config_path={last / 'train_config.json'}"]
     else:
         shutil.rmtree(cell.folder / "train", ignore_errors=True)
-        config = cell.folder / "train_config.json"
-        _write_json(config, cell.train_config())
-        arguments += [f"--config_path={config}"]
-    training = PROCESSES.Process(
-        target=_hdp_train, args=(arguments, cell.folder / "train.log", torch.get_num_threads())
-    )
-    training.start()
-    return training
+        (cell.folder / "progress.json").unlink(missing_ok=True)
+        _write_json(config_file, config)
+        arguments = [f"--config_path={config_file}"]
+    if deadline.seconds_left < math.inf:
+        arguments.append(f"--max_train_minutes={deadline.seconds_left / 60:.3f}")
+    progress = Progress.load(cell)
+    progress.runs.append(describe_run())
+    progress.save(cell)
+    return _start(cell.folder / "train.log", threads, _hdp_train, arguments, train_s)
 
 
-def _hdp_train(arguments: list[str], log: Path, threads: int) -> None:
-    """What the command `hdp-train` does, without its start-up time."""
-    with log.open("a") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-    torch.set_num_threads(threads)
+def _hdp_train(arguments: list[str], train_s: float) -> None:
+    """What the command `hdp-train` does; writes the seconds of training, after earlier ones, into each checkpoint."""
+    start, save_checkpoint = time.monotonic(), lerobot_train.save_checkpoint
+
+    def save_checkpoint_and_time(checkpoint_dir: Path, *args: Any, **kwargs: Any) -> None:
+        save_checkpoint(checkpoint_dir, *args, **kwargs)
+        _write_json(Path(checkpoint_dir) / TRAIN_S, train_s + time.monotonic() - start)
+
+    lerobot_train.save_checkpoint = save_checkpoint_and_time
     sys.argv = ["hdp-train", *arguments]
     hdp_train.main()
 
 
-def evaluate_checkpoints(cell: Cell, progress: Progress) -> None:
-    """Evaluate the checkpoints that are not in the learning curve yet, and delete all but the last one."""
-    last = last_step(cell.folder)
+def evaluate_checkpoints(cell: Cell, threads: int, deadline: Deadline) -> None:
+    """Evaluate the checkpoints that are not in the learning curve yet, and delete all but the last one.
+
+    Raises:
+        RuntimeError: an evaluation failed; names its log.
+    """
+    progress = Progress.load(cell)
     done = {point["step"] for point in progress.curve}
-    for checkpoint in sorted(path for path in cell.checkpoints.glob("[0-9]*") if int(path.name) <= last):
+    checkpoints = complete_checkpoints(cell.folder)
+    for checkpoint in checkpoints:
         step = int(checkpoint.name)
-        if step not in done and (step % cell.evaluate_every == 0 or step == cell.steps):
-            first_seed = FIRST_EVALUATION_SEED + len(progress.curve) * cell.starts
-            outcome = evaluate(checkpoint / "pretrained_model", cell.starts, first_seed)
-            progress.curve.append({"step": step, **outcome})
+        wanted = step % cell.evaluate_every == 0 or step == cell.steps
+        if wanted and step not in done:
+            if deadline.seconds_left < 0:
+                return
+            progress.curve.append({"step": step, **_evaluate(cell, checkpoint, threads)})
             progress.save(cell)
-        if step < last:
+        if checkpoint != checkpoints[-1]:
             shutil.rmtree(checkpoint)
+
+
+def _evaluate(cell: Cell, checkpoint: Path, threads: int) -> dict[str, Any]:
+    """Evaluate a checkpoint in a process of its own, whose memory, on a GPU too, is free again afterwards."""
+    number = math.ceil(int(checkpoint.name) / cell.evaluate_every) - 1
+    outcome, log = cell.folder / "evaluation.json", cell.folder / "evaluation.log"
+    outcome.unlink(missing_ok=True)
+    arguments = (checkpoint / "pretrained_model", cell.starts, FIRST_EVALUATION_SEED + number * cell.starts, outcome)
+    evaluation = _start(log, threads, _evaluate_into, *arguments)
+    try:
+        evaluation.join()
+    finally:
+        evaluation.terminate()
+    if not outcome.exists():
+        raise RuntimeError(f"{cell.name}: the evaluation of {checkpoint} failed, see {log}")
+    return json.loads(outcome.read_text())
+
+
+def _evaluate_into(path: Path, starts: int, first_seed: int, outcome: Path) -> None:
+    with torch.no_grad():
+        _write_json(outcome, evaluate(path, starts, first_seed))
 
 
 def result_of(cell: Cell, progress: Progress) -> dict[str, Any]:
     """What a results file says about a finished cell."""
+    assert cell.last_checkpoint is not None
     policy = get_policy_class(cell.policy["type"]).from_pretrained(cell.last_checkpoint)
+    train_s = json.loads((cell.last_checkpoint.parent / TRAIN_S).read_text())
     return {
         **cell.facts,
         "task": cell.env["task"].removesuffix("-v0"),
@@ -291,8 +398,8 @@ def result_of(cell: Cell, progress: Progress) -> dict[str, Any]:
         "policy": cell.policy,
         "parameters": num_parameters(policy),
         "network_calls_per_plan": policy.config.num_inference_steps,
-        "train_s": round(progress.train_s, 1),
-        "samples_per_second": round(cell.steps * cell.batch_size / progress.train_s, 1),
+        "train_s": round(train_s, 1),
+        "samples_per_second": round(cell.samples / train_s, 1),
         "curve": progress.curve,
     }
 
@@ -302,20 +409,55 @@ def num_parameters(policy: HDPPolicy) -> int:
     return sum(parameter.numel() for parameter in policy.planner.parameters())
 
 
-def last_step(folder: Path) -> int:
-    """Step of the last complete checkpoint in a cell's folder; 0 if there is none."""
-    last = folder / "train" / "checkpoints" / "last"
-    return int(last.resolve().name) if last.exists() else 0
+def record_dataset(cell: Cell, num_workers: int) -> None:
+    """Record a cell's demonstrations, if they are not there."""
+    if not (cell.dataset_root / "meta" / "episodes").exists():
+        config = RecordDatasetConfig(f"local/{cell.dataset_root.name}", cell.dataset_root, cell.demonstrations)
+        record(RecordConfig(config, cell.env_config, num_workers=num_workers, resume=True))
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def _start(log: Path, threads: int, function: Callable[..., None], *arguments: Any) -> BaseProcess:
+    """Start a process that writes to a log file and ends with this one."""
+    process = PROCESSES.Process(target=_run_with_log, args=(log, threads, function, *arguments), daemon=True)
+    process.start()
+    return process
+
+
+def _run_with_log(log: Path, threads: int, function: Callable[..., None], *arguments: Any) -> None:
+    with log.open("a") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    torch.set_num_threads(threads)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    function(*arguments)
+
+
+def _end_with_parent() -> None:
+    """A child of the fork server would outlive the process that asked for it, if that is killed."""
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+@contextmanager
+def _lock(path: Path) -> Iterator[None]:
+    """Hold a lock file.
+
+    Raises:
+        RuntimeError: another process holds it.
+    """
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RuntimeError(f"another process runs this cell: {path.parent}") from error
+        yield
+
+
+def _write_json(path: Path, content: Any) -> None:
     """Write a file, all of it or nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".new")
     unfinished.write_text(json.dumps(content, indent=2) + "\n")
     unfinished.rename(path)
-
-
-def _share_cores(processes: int) -> None:
-    """Let each process, and the training that it starts, use its part of the cores."""
-    torch.set_num_threads(max(1, (os.cpu_count() or 1) // processes))

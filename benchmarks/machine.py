@@ -9,13 +9,14 @@ from pathlib import Path
 
 import torch
 
+REPOSITORY = Path(__file__).parents[1]
+
 
 def describe_run() -> dict[str, object]:
     """The command, the code, the machine and the versions of the packages that matter, for a results file."""
     return {
         "command": "python -m " + " ".join([_module_name(), *sys.argv[1:]]),
-        "git_commit": _git("rev-parse", "--short", "HEAD")
-        + ("+changes" if _git("status", "--porcelain", "--", "*.py", "*.json", ":!benchmarks/results") else ""),
+        "git_commit": git_commit(),
         "cpu": _cpu_name(),
         "cores": os.cpu_count(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
@@ -24,13 +25,23 @@ def describe_run() -> dict[str, object]:
     }
 
 
+def git_commit() -> str:
+    """The commit of this code, `+changes` if it was changed since; in a packed folder, what its file `COMMIT` says."""
+    if (packed := REPOSITORY / "COMMIT").exists():
+        return packed.read_text().strip()
+    changes = _git("status", "--porcelain", "--", "*.py", "*.json", ":!benchmarks/results")
+    return _git("rev-parse", "--short", "HEAD") + ("+changes" if changes else "")
+
+
 def _module_name() -> str:
     specification = sys.modules["__main__"].__spec__
-    return specification.name if specification else sys.argv[0]
+    return specification.name.removesuffix(".__main__") if specification else sys.argv[0]
 
 
 def _git(*arguments: str) -> str:
-    return subprocess.run(["git", *arguments], capture_output=True, text=True, check=False).stdout.strip()
+    return subprocess.run(
+        ["git", *arguments], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    ).stdout.strip()
 
 
 def _cpu_name() -> str:

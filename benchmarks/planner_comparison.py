@@ -26,7 +26,7 @@ def main() -> None:
     cells = make_cells(PRESETS, TASKS, METHODS, options.seeds)
     if not options.report:
         run_cells(cells, options.processes)
-    write_report([cell.result_file for cell in cells if cell.result_file.exists()])
+    write_report(cells)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 from ..cells import run_cells
-from .packing import decompress, export, pack, unpack
+from .packing import export, join_files, pack, packed_cells, unpack
 from .presets import METHODS, PRESETS, TASKS, make_cells
 from .report import write_report
 
@@ -22,10 +22,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         "python -m benchmarks.paper", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--preset", nargs="+", dest="presets", choices=PRESETS, default=["default"])
+    parser.add_argument("--preset", nargs="+", dest="presets", choices=PRESETS, help="`default`; --list knows all")
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS, help="those that the preset has")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument(
+        "--packed", action="store_true", help="the cells of the packed folder that is the working folder"
+    )
     parser.add_argument("--budget_minutes", type=float, help="stop with checkpoints when it is spent")
     parser.add_argument("--processes", type=int, default=1, help="cells at a time, which share the cores")
     action = parser.add_mutually_exclusive_group()
@@ -34,11 +37,15 @@ def main() -> None:
     action.add_argument("--pack", type=Path, metavar="FOLDER", help="put what the missing cells need into a new folder")
     action.add_argument("--unpack", type=Path, metavar="FOLDER", help="take over what was run there")
     action.add_argument(
-        "--export", type=Path, metavar="FOLDER", help="write the finished cells' planners there, as small checkpoints"
+        "--export", type=Path, metavar="FOLDER", help="write the finished planners as small checkpoints"
     )
+    action.add_argument("--join", type=Path, metavar="FOLDER", help="join the files of such a checkpoint")
+    parser.add_argument("--max_file_size", default="5GB", help="of --export, e.g. 15MB")
     options = parser.parse_args()
 
-    cells = make_cells(options.presets, options.tasks, options.methods, options.seeds)
+    presets = options.presets or (list(PRESETS) if options.list else ["default"])
+    chosen = presets, options.tasks, options.methods, options.seeds
+    cells = packed_cells() if options.packed else make_cells(*chosen)
     if options.list:
         for cell in cells:
             print(f"{cell.group.removeprefix('paper/') + '/' + cell.name:60} {cell.state()}")
@@ -50,10 +57,13 @@ def main() -> None:
         unpack(options.unpack)
     elif options.export:
         for cell in cells:
-            if cell.state() == "finished":
-                export(cell.last_checkpoint, options.export / cell.name)
+            target = options.export / cell.facts["preset"] / cell.name
+            if cell.state() == "finished" and cell.last_checkpoint and not target.exists():
+                export(cell.last_checkpoint, target, options.max_file_size)
+                print(target)
+    elif options.join:
+        join_files(options.join)
     else:
-        decompress()
         run_cells(cells, options.processes, options.budget_minutes)
 
 

@@ -1,18 +1,20 @@
 """Carry cells to a machine that has neither a checkout nor a package registry, and their results back.
 
-    python -m benchmarks.paper --preset default --methods hdp --seeds 0 --pack cells
-    cd cells; PYTHONPATH=. python -m benchmarks.paper --preset default --methods hdp --seeds 0 --budget_minutes 9
-    python -m benchmarks.paper --unpack cells
+    python -m benchmarks.paper --preset default --methods hdp --seeds 0 --pack outputs/packed
+    cd outputs/packed; PYTHONPATH=. python -m benchmarks.paper --packed --budget_minutes 9
+    python -m benchmarks.paper --unpack outputs/packed
 
 The first and the last command are for here, the second one for there. The folder holds the code, the demonstrations
-(compressed; they are unpacked where cells first run) and the checkpoints of cells that were stopped. LeRobot and its
-dependencies must be installed there, this package need not be.
+(compressed; they are unpacked where cells first run) and the last checkpoints of cells that were stopped. LeRobot and
+its dependencies must be installed there, this package need not be.
 """
 
+import json
 import shutil
 import subprocess
 import tarfile
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -21,11 +23,13 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 from safetensors.torch import load_file, save_file
 
-from ..cells import DATASETS, RESULTS, WORK, Cell, last_step, record_dataset
+from ..cells import DATASETS, RESULTS, WORK, Cell, complete_checkpoints, record_dataset
+from ..machine import REPOSITORY, git_commit
 
 CODE = ("benchmarks/*.py", "benchmarks/paper", "dataset_tools", "gym_hdp_tasks", "lerobot_hdp", "lerobot_policy_hdp.py")
 METADATA = ("METADATA", "entry_points.txt")
-MAX_FILE_SIZE = "15MB"
+MAX_MIB = 40
+CELLS = "cells.json"
 WEIGHTS = "model.safetensors"
 ARCHIVE = "{}.tar.xz"
 
@@ -35,28 +39,42 @@ def pack(cells: Sequence[Cell], folder: Path) -> None:
 
     Raises:
         FileExistsError: the folder is there already.
+        ValueError: the folder is larger than `MAX_MIB`.
     """
     folder.mkdir(parents=True)
-    repository = Path(__file__).parents[2]
-    files = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard", *CODE],
-        cwd=repository,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.split()
+    tracked = ["git", "ls-files", "--cached", "--others", "--exclude-standard", *CODE]
+    files = subprocess.run(tracked, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout.split()
     for file in files:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(repository / file, folder / file)
+        shutil.copy(REPOSITORY / file, folder / file)
+    (folder / "COMMIT").write_text(git_commit() + "\n")
+    (folder / CELLS).write_text(json.dumps([asdict(cell) for cell in cells], indent=2) + "\n")
     _pack_metadata(folder)
     for cell in {cell.dataset_root: cell for cell in cells}.values():
         record_dataset(cell, num_workers=2)
         _compress(cell.dataset_root, folder)
     for cell in cells:
-        if cell.last_checkpoint.exists():
+        if cell.last_checkpoint is not None:
             _compress(cell.folder, folder)
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    print(f"{folder}: {len(cells)} cells, {size / 2**20:.1f} MiB")
+    mib = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 2**20
+    if mib > MAX_MIB:
+        raise ValueError(f"{folder} has {mib:.0f} MiB, more than {MAX_MIB}: pack fewer tasks, or no stopped cells")
+    print(f"{folder}: {len(cells)} cells, {mib:.1f} MiB")
+
+
+def packed_cells() -> list[Cell]:
+    """The cells of the packed folder that is the working folder, ready to run.
+
+    Raises:
+        FileNotFoundError: the working folder was not packed.
+    """
+    cells = [Cell(**fields) for fields in json.loads(Path(CELLS).read_text())]
+    for root in (DATASETS, WORK):
+        for archive in root.rglob(ARCHIVE.format("*")):
+            with tarfile.open(archive) as file:
+                file.extractall(archive.parent, filter="data")
+            archive.unlink()
+    return cells
 
 
 def _pack_metadata(folder: Path) -> None:
@@ -76,23 +94,23 @@ def _compress(source: Path, folder: Path) -> None:
         file.add(source.resolve(), source.name)
 
 
-def decompress() -> None:
-    """Unpack the archives that lie where their folders should be, below the working folder."""
-    for root in (DATASETS, WORK):
-        for archive in root.rglob(ARCHIVE.format("*")):
-            with tarfile.open(archive) as file:
-                file.extractall(archive.parent, filter="data")
-            archive.unlink()
-
-
 def unpack(folder: Path) -> None:
     """Take over the results of a folder, and the cells that went further there than here."""
+
+    def how_far(cell_folder: Path) -> tuple[int, int]:
+        complete, progress = complete_checkpoints(cell_folder), cell_folder / "progress.json"
+        evaluations = len(json.loads(progress.read_text())["curve"]) if progress.exists() else 0
+        return int(complete[-1].name) if complete else 0, evaluations
+
     for progress in (folder / WORK).rglob("progress.json"):
         there = progress.parent
         here = WORK / there.relative_to(folder / WORK)
-        if last_step(there) > last_step(here):
+        if how_far(there) > how_far(here):
+            new = here.with_name(f"{here.name}.new")
+            shutil.rmtree(new, ignore_errors=True)
+            shutil.copytree(there, new, symlinks=True)
             shutil.rmtree(here, ignore_errors=True)
-            shutil.copytree(there, here, symlinks=True)
+            new.rename(here)
             print(here)
     results = folder / "benchmarks" / "results"
     for file in results.rglob("*.json"):
@@ -103,13 +121,13 @@ def unpack(folder: Path) -> None:
             print(own)
 
 
-def export(checkpoint: Path, target: Path, max_file_size: str = MAX_FILE_SIZE) -> None:
-    """Write a checkpoint that only plans: the averaged weights, as bfloat16, in files of a limited size.
+def export(checkpoint: Path, target: Path, max_file_size: str = "5GB") -> None:
+    """Write a checkpoint that only plans: the averaged weights, as bfloat16.
 
     Args:
         checkpoint: a `pretrained_model` folder.
-        target: a new folder, of the same form if one file is enough; else `join_files` brings it into that form.
-        max_file_size: e.g. `15MB`.
+        target: a new folder of the same form, if one file is enough.
+        max_file_size: e.g. `15MB`. What needs more is written as several files, for `join_files`.
     """
     config = PreTrainedConfig.from_pretrained(checkpoint)
     policy = get_policy_class(config.type).from_pretrained(checkpoint)
