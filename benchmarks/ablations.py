@@ -27,6 +27,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "prediction_type=v_prediction": {"prediction_type": "v_prediction"},
     "symbol_loss_weight=1/30": {"symbol_loss_weight": 1 / 30},
     "symbol_loss_weight=1/1000": {"symbol_loss_weight": 1 / 1000},
+    "rotary=true": {"rotary": True},
     "mask_schedule=cosine": {"mask_schedule": "cosine"},
     "ema_max_decay=0": {"ema_max_decay": 0.0},
     "dropout=0.1": {"dropout": 0.1},

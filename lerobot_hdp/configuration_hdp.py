@@ -70,6 +70,7 @@ class HDPConfig(PreTrainedConfig):
         vocabulary: the symbols, PAD first; read from the dataset.
 
         num_layers, num_heads, width, dropout: the transformer; `width` is the size of a token.
+        rotary: rotary position embedding in self-attention, beside the learned vectors of the positions.
         object_tokens: True makes a condition token of each object in `observation.environment_state` (its components
             are named `object.component` in the dataset) and one of each other observation; False makes one of all.
         observation_token_sizes: how many numbers become each condition token; follows from the dataset.
@@ -120,6 +121,7 @@ class HDPConfig(PreTrainedConfig):
     num_heads: int = 4
     width: int = 256
     dropout: float | None = None
+    rotary: bool = False
     object_tokens: bool | None = None
     observation_token_sizes: list[int] | None = None
     observation_weight_std: float | None = None
@@ -173,6 +175,8 @@ class HDPConfig(PreTrainedConfig):
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
         if self.width % self.num_heads or self.width % 2:
             raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
+        if self.rotary and self.width // self.num_heads % 2:
+            raise ParsingError(f"rotary embedding needs an even width / num_heads, got {self.width} / {self.num_heads}")
         for name in ("horizon", "symbolic_horizon", "n_action_steps", "num_inference_steps", "num_candidates"):
             value = getattr(self, name)
             if value is not None and value < 1:

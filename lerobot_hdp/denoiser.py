@@ -2,7 +2,7 @@
 
 import math
 from contextlib import AbstractContextManager, nullcontext
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -38,6 +38,40 @@ class SinusoidalEmbedding(nn.Module):
         return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
+class RotaryDecoderLayer(nn.TransformerDecoderLayer):
+    """A transformer layer whose self-attention knows positions as rotations (RoFormer, Su et al. 2021).
+
+    Args:
+        positions: (L,) of the tokens; attention depends on their differences.
+        args, kwargs: of `nn.TransformerDecoderLayer`, with `batch_first=True`.
+    """
+
+    def __init__(self, positions: Tensor, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        half = self.self_attn.head_dim // 2
+        angles = positions[:, None] * 10_000 ** (-torch.arange(half) / half)
+        self.cosines: Tensor
+        self.sines: Tensor
+        self.register_buffer("cosines", angles.cos(), persistent=False)
+        self.register_buffer("sines", angles.sin(), persistent=False)
+
+    def _sa_block(
+        self, x: Tensor, attn_mask: Tensor | None, key_padding_mask: Tensor | None, is_causal: bool = False
+    ) -> Tensor:
+        attention = self.self_attn
+        projected = F.linear(x, attention.in_proj_weight, attention.in_proj_bias)
+        query, key, value = projected.unflatten(-1, (3, attention.num_heads, attention.head_dim)).permute(2, 0, 3, 1, 4)
+        dropout = attention.dropout if self.training else 0.0
+        attended = F.scaled_dot_product_attention(self._rotate(query), self._rotate(key), value, dropout_p=dropout)
+        return self.dropout1(attention.out_proj(attended.transpose(1, 2).flatten(2)))
+
+    def _rotate(self, vectors: Tensor) -> Tensor:
+        """Rotate each pair of components (i, i + half) by its token's angle: (B, heads, L, head_dim)."""
+        first, second = vectors.chunk(2, dim=-1)
+        cosines, sines = self.cosines.to(vectors.dtype), self.sines.to(vectors.dtype)
+        return torch.cat([first * cosines - second * sines, first * sines + second * cosines], dim=-1)
+
+
 class Denoiser(nn.Module):
     """(motion prediction, symbol prediction) = D_theta(A_c, A_d, O, k_c, k_d).
 
@@ -55,6 +89,7 @@ class Denoiser(nn.Module):
         symbol_states: size of the vector that stands for a symbol.
         shared_level: k_d is always k_c, so that only the latter is a condition.
         num_layers, num_heads, width, dropout: of the transformer. Dropout acts in attention and feed-forward layers.
+        rotary: tell self-attention the tokens' distances, too; symbols count as spread evenly over the motion.
     """
 
     def __init__(
@@ -71,6 +106,7 @@ class Denoiser(nn.Module):
         num_heads: int,
         width: int,
         dropout: float,
+        rotary: bool = False,
     ):
         super().__init__()
         self.horizon = horizon
@@ -92,9 +128,13 @@ class Denoiser(nn.Module):
         condition_tokens = 1 + int(self.embeds_symbol_level) + observation_tokens
         self.condition_positions = nn.Parameter(torch.empty(1, condition_tokens, width))
         self.condition_encoder = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        layer = nn.TransformerDecoderLayer(
-            width, num_heads, 4 * width, dropout, activation="gelu", batch_first=True, norm_first=True
-        )
+        sizes = (width, num_heads, 4 * width, dropout)
+        kinds: dict[str, Any] = {"activation": "gelu", "batch_first": True, "norm_first": True}
+        if rotary:
+            places = torch.cat([torch.arange(horizon), torch.linspace(0, horizon - 1, symbolic_horizon)])
+            layer: nn.TransformerDecoderLayer = RotaryDecoderLayer(places, *sizes, **kinds)
+        else:
+            layer = nn.TransformerDecoderLayer(*sizes, **kinds)
         self.decoder = nn.TransformerDecoder(layer, num_layers, norm=nn.LayerNorm(width))
         self.apply(_initialise)
         nn.init.normal_(self.positions, std=0.02)

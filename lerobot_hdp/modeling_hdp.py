@@ -45,6 +45,7 @@ class Planner(nn.Module):
             num_heads=config.num_heads,
             width=config.width,
             dropout=config.dropout,
+            rotary=config.rotary,
         )
 
     @property

@@ -6,6 +6,7 @@ from draccus.utils import ParsingError
 from lerobot.policies import make_policy
 
 from lerobot_hdp import FREE, HDPConfig, PlanPrompt
+from lerobot_hdp.denoiser import RotaryDecoderLayer
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.prompt import encode_prompt
 
@@ -230,6 +231,29 @@ def test_a_checkpoint_plans_the_same(make_planner, batch, tmp_path):
     first, second = (p.eval().plan(inputs, generator=torch.Generator().manual_seed(0)) for p in (policy, loaded))
     assert torch.equal(first.actions, second.actions)
     assert first.symbols() == second.symbols()
+
+
+def test_rotary_attention_is_plain_attention_that_knows_distances():
+    plain = torch.nn.TransformerDecoderLayer(32, 4, 64, 0.0, batch_first=True, norm_first=True)
+    tokens, memory = torch.randn(2, 5, 32), torch.randn(2, 3, 32)
+
+    def rotary(positions):
+        layer = RotaryDecoderLayer(torch.tensor(positions), 32, 4, 64, 0.0, batch_first=True, norm_first=True)
+        layer.load_state_dict(plain.state_dict())
+        return layer(tokens, memory)
+
+    torch.testing.assert_close(rotary([0.0] * 5), plain(tokens, memory))
+    torch.testing.assert_close(rotary([0.0, 1, 2, 5, 9]), rotary([3.0, 4, 5, 8, 12]), atol=1e-4, rtol=1e-4)
+    assert not torch.allclose(rotary([0.0, 1, 2, 5, 9]), rotary([0.0, 1, 2, 5, 6]), atol=1e-4)
+
+
+@pytest.mark.parametrize("policy_type", ["hdp", "joint_diffuser"])
+def test_rotary_embedding_can_be_switched_on(make_planner, batch, policy_type):
+    policy, preprocessor, _ = make_planner(policy_type, rotary=True)
+    losses = [parts["motion_loss"] for parts in train_in_process(policy, preprocessor(batch), steps=60)]
+    assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
+    plan = policy.eval().plan(observation(preprocessor(batch)))
+    assert plan.actions.shape == (4, HORIZON, 3)
 
 
 def test_bfloat16_can_be_switched_on(make_planner, batch):

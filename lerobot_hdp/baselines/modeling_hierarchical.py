@@ -44,6 +44,7 @@ class HierarchicalPlanner(nn.Module):
                 num_heads=config.num_heads,
                 width=config.width,
                 dropout=config.dropout,
+                rotary=config.rotary,
             )
 
         self.encode_observation = encoder(observed)
