@@ -1,5 +1,6 @@
 """What the pages in `docs/` share that are written from results files: names, tables, plots."""
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import mean
@@ -50,7 +51,7 @@ def plot_curves(panels: dict[str, dict[str, list[Curve]]], path: Path) -> None:
         path: of the SVG file.
     """
     plt = use_svg()
-    columns = min(3, len(panels))
+    columns = math.ceil(math.sqrt(len(panels)))
     rows = -(-len(panels) // columns)
     figure, axes = plt.subplots(rows, columns, figsize=(3.6 * columns, 2.7 * rows), squeeze=False, layout="constrained")
     for axis in axes.flat[len(panels) :]:
