@@ -214,8 +214,8 @@ def latency() -> str:
     return (
         f"{markdown_table(header, rows)}\n{result['num_layers']} layers of width {result['width']}, on "
         f"{content['run']['gpu'] or content['run']['cpu']}; medians ([spread](planner_latency.md)). "
-        f"`{content['run']['command']}`\n\nOn a CPU, time goes with the number of tokens: in the paper's setting HDP has "
-        "108 more, most of them PAD; without padding (`--preset default`) 36.\n"
+        f"`{content['run']['command']}`\n\nOn a CPU, time goes with the number of tokens: in the paper's setting HDP "
+        "has 108 more, most of them PAD; without padding (`--preset default`) 36.\n"
     )
 
 
