@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_train
 
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
@@ -31,10 +30,9 @@ from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.scripts import hdp_train
 
-from .evaluation import evaluate
-from .machine import describe_run
+from .evaluation import evaluate, load_policy
+from .machine import RESULTS, describe_run
 
-RESULTS = Path(__file__).parent / "results"
 WORK = Path("outputs/cells")
 DATASETS = Path("outputs/datasets")
 FIRST_EVALUATION_SEED = 1_000_000
@@ -306,7 +304,7 @@ def start_training(cell: Cell, threads: int, deadline: Deadline) -> BaseProcess:
         ValueError: the cell was begun with other settings.
     """
     config_file, config = cell.folder / "train_config.json", cell.train_config()
-    arguments, train_s = [], 0.0
+    train_s = 0.0
     if last := cell.last_checkpoint:
         if json.loads(config_file.read_text()) != config:
             raise ValueError(f"{cell.folder} was begun with other settings: delete it to begin again")
@@ -376,14 +374,13 @@ def _evaluate(cell: Cell, checkpoint: Path, threads: int) -> dict[str, Any]:
 
 
 def _evaluate_into(path: Path, starts: int, first_seed: int, outcome: Path) -> None:
-    with torch.no_grad():
-        _write_json(outcome, evaluate(path, starts, first_seed))
+    _write_json(outcome, evaluate(path, starts, first_seed))
 
 
 def result_of(cell: Cell, progress: Progress) -> dict[str, Any]:
     """What a results file says about a finished cell."""
     assert cell.last_checkpoint is not None
-    policy = get_policy_class(cell.policy["type"]).from_pretrained(cell.last_checkpoint)
+    policy, *_ = load_policy(cell.last_checkpoint)
     train_s = json.loads((cell.last_checkpoint.parent / TRAIN_S).read_text())
     return {
         **cell.facts,

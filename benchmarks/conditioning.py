@@ -29,8 +29,7 @@ from gym_hdp_tasks.block_sorting_2d import SLOT_HALF_SIZE, block_name
 from lerobot_hdp.candidates import best_candidates
 
 from .evaluation import Subject, execute, load, make_plans, rate, wilson_interval
-from .machine import describe_run
-from .train_and_evaluate import RESULTS
+from .machine import RESULTS, describe_run
 
 CANDIDATES = (1, 2, 4, 8)
 

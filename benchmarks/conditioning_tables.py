@@ -4,12 +4,13 @@ python -m benchmarks.conditioning_tables
 """
 
 import json
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
-from .train_and_evaluate import RESULTS
+from .machine import RESULTS
+from .pages import DOCS, markdown_table
 
-PAGE = Path(__file__).parents[1] / "docs" / "conditioning.md"
+PAGE = DOCS / "conditioning.md"
 HEADING = "## Measured\n"
 
 
@@ -21,22 +22,22 @@ def percent(measured: dict[str, Any]) -> str:
     return f"{100 * measured['rate']:.1f} % ({low:.1f} to {high:.1f})"
 
 
-def adherence_rows(result: dict[str, Any]) -> list[str]:
+def adherence_rows(result: dict[str, Any]) -> list[list[str]]:
     cells = [result["planner"], *(percent(result[name]["adherence"]) for name in ("with_prompt", "without_prompt"))]
-    return [" | ".join([*cells, str(result["with_prompt"]["adherence"]["of"]), str(result["network_calls_per_plan"])])]
+    return [[*cells, str(result["with_prompt"]["adherence"]["of"]), str(result["network_calls_per_plan"])]]
 
 
-def valid_plan_rows(result: dict[str, Any]) -> list[str]:
+def valid_plan_rows(result: dict[str, Any]) -> list[list[str]]:
     given, free = (percent(result[name]["success"]) for name in ("valid_plan_given", "nothing_given"))
-    return [f"{_name(result)} | {given} | {free} | {result['starts']} | {result['network_calls_per_plan']}"]
+    return [[_name(result), given, free, str(result["starts"]), str(result["network_calls_per_plan"])]]
 
 
-def candidates_rows(result: dict[str, Any]) -> list[str]:
-    return [
-        f"{_name(result)} | {best['k']} | {percent(best['by_likelihood'])} | {percent(best['by_checker'])} | "
-        f"{best['seconds_per_plan']:.2f} s"
-        for best in result["best_of"]
-    ]
+def candidates_rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for best in result["best_of"]:
+        rates = [percent(best[name]) for name in ("by_likelihood", "by_checker")]
+        rows.append([_name(result), str(best["k"]), *rates, f"{best['seconds_per_plan']:.2f} s"])
+    return rows
 
 
 def _name(result: dict[str, Any]) -> str:
@@ -44,33 +45,35 @@ def _name(result: dict[str, Any]) -> str:
     return f"{result['task'].removesuffix('-v0')}{f', {blocks} blocks' if blocks else ''}"
 
 
-ADHERENCE = "planner | asked for, with the prompt | without | plans that count | network calls"
+ADHERENCE = ("planner", "asked for, with the prompt", "without", "plans that count", "network calls")
 TABLES = (
     ("adherence_XArmToolUseRedOnTop", "P(red on top, given that all are stacked); the prompt: red last", ADHERENCE),
     ("adherence_BlockSorting2D", "P(the named block is moved first, given success); the prompt: that block", ADHERENCE),
-    ("valid_plan_BlockSorting2D", "Success", "task | a valid plan given | nothing given | starts | network calls"),
+    (
+        "valid_plan_BlockSorting2D",
+        "Success",
+        ("task", "a valid plan given", "nothing given", "starts", "network calls"),
+    ),
     (
         "candidates_BlockSorting2D",
         "Success of the best of k plans",
-        "task | k | by likelihood | by the task's checker, then likelihood | time for a plan",
+        ("task", "k", "by likelihood", "by the task's checker, then likelihood", "time for a plan"),
     ),
 )
 ROWS = {"adherence": adherence_rows, "valid": valid_plan_rows, "candidates": candidates_rows}
 
 
-def table(file: str, title: str, header: str) -> str:
+def table(file: str, title: str, header: Sequence[str]) -> str:
     """One results file as a table, with the command that made it."""
     path = RESULTS / f"{file}.json"
     if not path.exists():
         return f"**{title}**: not yet run.\n"
     contents = json.loads(path.read_text())
     make_rows = ROWS[file.split("_")[0]]
-    rows = [header, " | ".join(["---"] * len(header.split("|")))]
-    rows += [row for result in contents["results"] for row in make_rows(result)]
-    lines = "\n".join(f"| {row} |" for row in rows)
+    lines = markdown_table(header, [row for result in contents["results"] for row in make_rows(result)])
     run = contents["run"]
     where = run.get("gpu") or run["cpu"]
-    return f"**{title}** ([json](../benchmarks/results/{path.name}))\n\n{lines}\n\n`{run['command']}`, on {where}.\n"
+    return f"**{title}** ([json](../benchmarks/results/{path.name}))\n\n{lines}\n`{run['command']}`, on {where}.\n"
 
 
 def main() -> None:

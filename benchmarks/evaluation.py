@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.policies import get_policy_class, make_pre_post_processors
+from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 
 import lerobot_policy_hdp  # noqa: F401 (registers the policies and the tasks)
 from gym_hdp_tasks.block_sorting_2d import block_name
@@ -77,6 +77,21 @@ class Plans(NamedTuple):
     symbols: list[list[str]]
 
 
+def load_policy(path: Path, **options: Any) -> tuple[PreTrainedPolicy, Any, Any]:
+    """A checkpoint's policy, preprocessor and postprocessor.
+
+    Args:
+        path: a `pretrained_model` folder.
+        options: fields of the policy's configuration to be set otherwise.
+    """
+    config = PreTrainedConfig.from_pretrained(path)
+    for name, value in options.items():
+        setattr(config, name, value)
+    policy = get_policy_class(config.type).from_pretrained(path, config=config)
+    device = {"device_processor": {"device": config.device}}
+    return policy, *make_pre_post_processors(config, str(path), preprocessor_overrides=device)
+
+
 def load(
     path: Path, starts: int, num_inference_steps: int | None = None, gym_id: str | None = None, first_seed: int = 0
 ) -> Subject:
@@ -89,12 +104,8 @@ def load(
         gym_id: a task with the parameters of the one that the checkpoint was trained for.
         first_seed: the others follow it.
     """
-    config = PreTrainedConfig.from_pretrained(path)
-    policy = get_policy_class(config.type).from_pretrained(path)
-    if num_inference_steps:
-        policy.config.num_inference_steps = num_inference_steps
-    device = {"device_processor": {"device": policy.config.device}}
-    preprocessor, postprocessor = make_pre_post_processors(policy.config, path, preprocessor_overrides=device)
+    options = {"num_inference_steps": num_inference_steps} if num_inference_steps else {}
+    policy, preprocessor, postprocessor = load_policy(path, **options)
     task = TrainPipelineConfig.from_pretrained(path).env.planning_task
     gym_id = gym_id or task.gym_id
     env = gym.make(gym_id, disable_env_checker=True, **task.parameters)

@@ -15,23 +15,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
-from lerobot.policies import make_pre_post_processors
-from lerobot.policies.factory import get_policy_class
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from lerobot.utils.random_utils import set_seed
 
-import lerobot_policy_hdp  # noqa: F401 (registers the planners)
 from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.configuration_hdp import SAMPLERS
 
-from .evaluation import wilson_interval
-from .machine import describe_run
+from .evaluation import load_policy, wilson_interval
+from .machine import RESULTS, describe_run
+from .pages import DOCS, markdown_table
 
-RESULTS = Path(__file__).parent / "results" / "few_step_planning"
-PAGE = Path(__file__).parents[1] / "docs" / "few_steps.md"
+FOLDER = RESULTS / "few_step_planning"
+PAGE = DOCS / "few_steps.md"
 FIRST_SEED = 2_000_000
 PREAMBLE = """# Plans in few network calls
 
@@ -44,19 +41,15 @@ planner is sure of them. Set `--policy.sampler` and `--policy.num_inference_step
 
 def evaluate(checkpoint: Path, env: HDPEnv, sampler: str, calls: int, episodes: int) -> dict[str, Any]:
     """Plan and execute `episodes` starts at once."""
-    config = PreTrainedConfig.from_pretrained(checkpoint)
-    config.sampler, config.num_inference_steps, config.pretrained_path = sampler, calls, checkpoint
-    policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config).eval()
+    policy, *processors = load_policy(checkpoint, sampler=sampler, num_inference_steps=calls)
     set_seed(0)
     environments = make_env(env, n_envs=episodes)
     start = time.perf_counter()
     info = eval_policy_all(
         environments,
         policy,
-        *make_env_pre_post_processors(env, config),
-        *make_pre_post_processors(
-            config, str(checkpoint), preprocessor_overrides={"device_processor": {"device": config.device}}
-        ),
+        *make_env_pre_post_processors(env, policy.config),
+        *processors,
         n_episodes=episodes,
         start_seed=FIRST_SEED,
     )["overall"]
@@ -74,7 +67,7 @@ def evaluate(checkpoint: Path, env: HDPEnv, sampler: str, calls: int, episodes: 
 def write_page() -> None:
     """All results as tables, one for each task."""
     page = PREAMBLE
-    for path in sorted(RESULTS.glob("*.json")):
+    for path in sorted(FOLDER.glob("*.json")):
         file = json.loads(path.read_text())
         result = file["result"]
         cells = {(point["sampler"], point["calls"]): point for point in result["curve"]}
@@ -82,11 +75,11 @@ def write_page() -> None:
         page += f"## `{result['planner']}`, {result['task']}\n\n"
         page += f"{result['episodes']} starts, one checkpoint of {result['train_steps']} steps; "
         page += f"`{file['run']['command']}`.\n\n"
-        page += f"| calls | {' | '.join(f'`{sampler}`' for sampler in samplers)} |\n|---|{'---|' * len(samplers)}\n"
-        for calls in sorted({key[1] for key in cells}):
-            row = [cells.get((sampler, calls)) for sampler in samplers]
-            page += f"| {calls} | {' | '.join(map(_percent, row))} |\n"
-        page += "\n"
+        rows = [
+            [str(calls), *(_percent(cells.get((sampler, calls))) for sampler in samplers)]
+            for calls in sorted({key[1] for key in cells})
+        ]
+        page += markdown_table(["calls", *(f"`{sampler}`" for sampler in samplers)], rows) + "\n"
     PAGE.write_text(page.rstrip() + "\n")
 
 
@@ -120,8 +113,8 @@ def main() -> None:
         "train_steps": train_config.steps,
         "curve": curve,
     }
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / f"{planner}_{task}.json").write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    (FOLDER / f"{planner}_{task}.json").write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
     write_page()
 
 

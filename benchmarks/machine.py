@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 REPOSITORY = Path(__file__).parents[1]
+RESULTS = REPOSITORY / "benchmarks" / "results"
 
 
 def describe_run() -> dict[str, object]:

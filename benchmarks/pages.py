@@ -6,7 +6,9 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-DOCS = Path(__file__).parents[1] / "docs"
+from .machine import REPOSITORY
+
+DOCS = REPOSITORY / "docs"
 LABELS = {
     "hdp": "HDP",
     "diffuser": "Diffuser",

@@ -28,13 +28,12 @@ from lerobot_hdp.modeling_hdp import HDPPolicy
 
 from .cells import num_parameters
 from .machine import describe_run
-from .paper.presets import METHODS
+from .pages import DOCS, markdown_table
+from .paper.presets import ENVS, METHODS, PRESETS, make_cell
 
 RESULTS = Path(__file__).parent / "results" / "planner_latency.json"
-TABLE = Path(__file__).parents[1] / "docs" / "planner_latency.md"
+TABLE = DOCS / "planner_latency.md"
 REFERENCE = "diffuser"
-PAPER_SYMBOLIC_HORIZON = 108
-"""H_d of the paper's sorting tasks, filled with PAD."""
 
 
 def make_planner(policy_type: str, env: HDPEnv, **options) -> HDPPolicy:
@@ -94,21 +93,22 @@ def write_table() -> None:
         f"{result['width']}, {result['num_inference_steps']} steps a plan. Median and quartiles of {result['rounds']} "
         "rounds; a ratio compares two times of the same round.",
         "",
-        "| planner | parameters | over Diffuser |" + "".join(f" batch {n}, ms | over Diffuser |" for n in sizes),
-        "|---|---|---|" + "---|---|" * len(sizes),
     ]
+    header, rows = ["planner", "parameters", "over Diffuser"], []
+    for size in sizes:
+        header += [f"batch {size}, ms", "over Diffuser"]
     for name in METHODS:
         cells = [f"`{name}`", f"{result['parameters'][name]:,}", f"{result['parameter_ratio'][name] - 1:+.1%}"]
         for measured in sizes.values():
             for low, middle, high in (measured[name]["ms"], measured[name]["ratio"]):
                 cells.append(f"{middle:g} ({low:g} to {high:g})")
-        lines.append(f"| {' | '.join(cells)} |")
-    TABLE.write_text("\n".join(lines) + "\n")
+        rows.append(cells)
+    TABLE.write_text("\n".join([*lines, markdown_table(header, rows)]))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", default="XArmSorting-v0")
+    parser.add_argument("--task", choices=PRESETS["paper"].tasks, default="xarm_sorting")
     parser.add_argument("--batch_sizes", type=int, nargs="+", default=[1, 50])
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--num_inference_steps", type=int, default=5)
@@ -119,13 +119,12 @@ def main() -> None:
     options = parser.parse_args()
 
     torch.set_num_threads(options.threads)
-    env = HDPEnv(task=options.task)
+    env = HDPEnv(**ENVS[options.task])
     sizes = {name: getattr(options, name) for name in ("num_layers", "width", "num_inference_steps", "device")}
     planners = {}
     for name in METHODS:
-        config_class = PreTrainedConfig.get_choice_class(name)
-        symbols = {"symbolic_horizon": PAPER_SYMBOLIC_HORIZON} if config_class.symbol_process else {}
-        planners[name] = make_planner(name, env, preset="paper", **sizes, **symbols)
+        policy = make_cell("paper", options.task, name, seed=0).policy
+        planners[name] = make_planner(policy.pop("type"), env, **policy, **sizes)
 
     parameters = {name: num_parameters(policy) for name, policy in planners.items()}
     result = {

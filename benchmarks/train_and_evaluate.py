@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from .evaluation import wilson_interval
-from .machine import describe_run
+from .machine import RESULTS, describe_run
 
-RESULTS = Path(__file__).parent / "results"
 OUTPUTS = Path("outputs/benchmarks")
 
 

@@ -19,12 +19,11 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 from huggingface_hub import save_torch_state_dict
-from lerobot.configs import PreTrainedConfig
-from lerobot.policies.factory import get_policy_class
 from safetensors.torch import load_file, save_file
 
-from ..cells import DATASETS, RESULTS, WORK, Cell, complete_checkpoints, record_dataset
-from ..machine import REPOSITORY, git_commit
+from ..cells import DATASETS, WORK, Cell, complete_checkpoints, record_dataset
+from ..evaluation import load_policy
+from ..machine import REPOSITORY, RESULTS, git_commit
 
 CODE = ("benchmarks/*.py", "benchmarks/paper", "dataset_tools", "gym_hdp_tasks", "lerobot_hdp", "lerobot_policy_hdp.py")
 METADATA = ("METADATA", "entry_points.txt")
@@ -129,8 +128,7 @@ def export(checkpoint: Path, target: Path, max_file_size: str = "5GB") -> None:
         target: a new folder of the same form, if one file is enough.
         max_file_size: e.g. `15MB`. What needs more is written as several files, for `join_files`.
     """
-    config = PreTrainedConfig.from_pretrained(checkpoint)
-    policy = get_policy_class(config.type).from_pretrained(checkpoint)
+    policy, *_ = load_policy(checkpoint)
     if policy.ema is not None:
         policy.planner.load_state_dict(policy.ema.module.state_dict())
         policy.ema, policy.config.ema_max_decay = None, 0.0

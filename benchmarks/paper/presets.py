@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
+from lerobot.configs import PreTrainedConfig
+
 from ..cells import Cell
 
 METHODS = ("hdp", "diffuser", "joint_diffuser", "separate_diffuser", "hd", "chd")
@@ -127,8 +129,8 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
     policy = {"type": method, **preset.policy, **training.policy}
     if method == "hdp":
         policy |= preset.hdp_policy
-    if method in ("diffuser", *HIERARCHICAL):
-        policy.pop("symbolic_horizon", None)  # they have no symbols
+    if PreTrainedConfig.get_choice_class(method).symbol_process is None:
+        policy.pop("symbolic_horizon", None)
     return Cell(
         group=f"paper/{preset_name}",
         name=f"{task}_{method}_seed{seed}",

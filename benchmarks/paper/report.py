@@ -8,8 +8,9 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
-from ..cells import RESULTS, read_result
+from ..cells import read_result
 from ..conditioning_tables import percent
+from ..machine import RESULTS
 from ..pages import COLOURS, DOCS, LABELS, markdown_table, plot_curves, save_figure, use_svg
 from . import published
 from .presets import METHODS, PRESETS, TASKS, make_cells
@@ -158,10 +159,15 @@ def plot_blocks(results: Results, path: Path) -> None:
     save_figure(figure, path)
 
 
+def _conditioning(file: str) -> list[dict[str, Any]]:
+    """What `benchmarks.conditioning` wrote; nothing, if it was not run."""
+    path = RESULTS / f"{file}.json"
+    return json.loads(path.read_text())["results"] if path.exists() else []
+
+
 def valid_plan() -> str:
     """Success with the expert's symbolic plan given, and with none, over the number of blocks."""
-    path = RESULTS / "valid_plan_BlockSorting2D.json"
-    measured = {result["parameters"]["n_blocks"]: result for result in json.loads(path.read_text())["results"]}
+    measured = {result["parameters"]["n_blocks"]: result for result in _conditioning("valid_plan_BlockSorting2D")}
     rows = []
     for blocks in (2, 3, 4):
         result = measured.get(blocks)
@@ -176,8 +182,7 @@ def adherence() -> str:
     """The paper's "conditional plan coherence", ours beside it, and the same measure on 2D sorting."""
     measured: dict[str, dict[str, str]] = {}
     for column, file in (("red", "adherence_XArmToolUseRedOnTop"), ("first", "adherence_BlockSorting2D")):
-        path = RESULTS / f"{file}.json"
-        for result in json.loads(path.read_text())["results"] if path.exists() else []:
+        for result in _conditioning(file):
             own = measured.setdefault(result["planner"], {})
             for name in ("with_prompt", "without_prompt"):
                 own[f"{column}, {name}"] = percent(result[name]["adherence"])
