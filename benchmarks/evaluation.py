@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,11 @@ from lerobot_hdp import PlanPrompt
 
 BATCH = 50
 """Plans that are made at once."""
+MISTAKES = ("missed", "lost", "misplaced")
+"""How a motion fails: the gripper closes on nothing; what it holds slips out; or neither, and something was taken, or
+set down, that should not have been, there."""
+GRIPS_BELOW, EMPTY_BELOW = 0.1, 0.15
+"""A gripper that is told to close to less than the first, and closes to less than the second, holds nothing."""
 Outcome = dict[str, Any]
 """`is_success`, and what else is known of an executed plan."""
 
@@ -153,6 +159,23 @@ def execute(subject: Subject, motions: np.ndarray, seeds: Sequence[int]) -> list
     return outcomes
 
 
+def first_mistake(subject: Subject, motion: np.ndarray, seed: int) -> str:
+    """What goes wrong first in a motion that fails, one of `MISTAKES`."""
+    env = subject.make_env().unwrapped
+    env.reset(seed=seed)
+    held = False
+    for action in motion:
+        env.step(action)
+        if action[-1] >= GRIPS_BELOW:
+            held = False
+            continue
+        empty = env.gripper_opening() < EMPTY_BELOW if "XArm" in subject.gym_id else env.held is None
+        if empty:
+            return "lost" if held else "missed"
+        held = True
+    return "misplaced"
+
+
 def rate(hits: Sequence[bool]) -> dict[str, Any]:
     """How often, with its 95 % interval (Wilson)."""
     hits = [bool(hit) for hit in hits]
@@ -162,7 +185,7 @@ def rate(hits: Sequence[bool]) -> dict[str, Any]:
 
 
 def evaluate(path: Path, starts: int, first_seed: int) -> dict[str, Any]:
-    """Success and mean score of a checkpoint, and of the failures how many had a valid symbolic plan.
+    """Success and mean score of a checkpoint; of the failures how many had a valid symbolic plan, and how these failed.
 
     Args:
         path: a `pretrained_model` folder.
@@ -179,8 +202,11 @@ def evaluate(path: Path, starts: int, first_seed: int) -> dict[str, Any]:
     if subject.policy.symbol_process is not None:
         check = subject.make_env().unwrapped.planning_task.check_plan
         valid = [not check(*pair) for pair in zip(plans.symbols, subject.observations, strict=True)]
-        failed = [plan for plan, outcome in zip(valid, outcomes, strict=True) if not outcome["is_success"]]
-        result |= {"valid_plans": sum(valid), "failures_with_valid_plan": sum(failed), "failures": len(failed)}
+        failed = [index for index, outcome in enumerate(outcomes) if not outcome["is_success"]]
+        of_motion = [index for index in failed if valid[index]]
+        mistakes = Counter(first_mistake(subject, plans.motions[index], subject.seeds[index]) for index in of_motion)
+        result |= {"valid_plans": sum(valid), "failures": len(failed), "failures_with_valid_plan": len(of_motion)}
+        result["first_mistakes"] = {mistake: mistakes[mistake] for mistake in MISTAKES}
     return result
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from ..cells import read_result
 from ..conditioning_tables import percent
+from ..evaluation import MISTAKES
 from ..machine import RESULTS
 from ..pages import COLOURS, DOCS, LABELS, markdown_table, plot_curves, save_figure, use_svg
 from . import published
@@ -242,16 +243,22 @@ def training_time(results: Results) -> str:
 
 
 def failures(results: Results) -> str:
-    """Of HDP's failures, which had a valid symbolic plan."""
+    """Of HDP's failures, which had a valid symbolic plan, and what went wrong first in the motion of these."""
     rows = []
     for preset, settings in PRESETS.items():
         for task in settings.tasks:
             if not (contents := results.get((preset, task, "hdp"))):
-                rows.append([f"{task}, {preset}", MISSING, "", "", ""])
+                rows.append([f"{task}, {preset}", MISSING, *[""] * (3 + len(MISTAKES))])
                 continue
             points = last_points(contents)
             failed, with_valid = (sum(p[name] for p in points) for name in ("failures", "failures_with_valid_plan"))
             starts = contents[0]["result"]["starts"] * len(points)
-            rows.append([f"{task}, {preset}", *map(str, (starts, failed, failed - with_valid, with_valid))])
+            row = [f"{task}, {preset}", *map(str, (starts, failed, failed - with_valid, with_valid))]
+            if all("first_mistakes" in point for point in points):
+                row += [str(sum(point["first_mistakes"][mistake] for point in points)) for mistake in MISTAKES]
+            else:
+                row += ["not counted"] * len(MISTAKES)
+            rows.append(row)
     header = ["task, preset", "starts", "failures", "the symbolic plan was invalid", "it was valid, the motion failed"]
-    return markdown_table(header, rows)
+    mistakes = ["of these: closed on nothing", "lost what it held", "took or set down in a wrong place"]
+    return markdown_table(header + mistakes, rows)
