@@ -79,7 +79,7 @@ def record_on_cluster(config: ClusterRecordConfig) -> None:
             **kwargs,
         }
         workers = min(config.num_workers, tasks)
-        conda = os.environ.get("CONDA_PREFIX")
+        conda = None if sys.prefix != sys.base_prefix else os.environ.get("CONDA_PREFIX")
         environment = {"condaenv": conda} if conda else {"venv_path": str(Path(sys.prefix) / "bin" / "activate")}
         if config.slurm.partition is None:
             return LocalPipelineExecutor(workers=workers, **common)

@@ -222,7 +222,8 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
             state: (B, S) what is observed now.
             level: (B,) of both.
         """
-        high = network.denoise_subgoals(subgoals, state, level, segments)
+        # A copy: a CUDA graph's output is overwritten when the next one runs.
+        high = network.denoise_subgoals(subgoals, state, level, segments).clone()
         current = self.motion_process.predicted_sample(subgoals, high.detach().float(), level)
         low = network.denoise_segments(segments, state, current, level.repeat_interleave(self.config.num_segments))
         return high, low
