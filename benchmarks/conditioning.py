@@ -32,6 +32,7 @@ from .evaluation import Subject, execute, load, make_plans, rate, wilson_interva
 from .machine import RESULTS, describe_run
 
 CANDIDATES = (1, 2, 4, 8)
+TIMED_STARTS = 20
 
 
 def adherence(checkpoints: Sequence[Path], starts: int, num_inference_steps: int | None) -> list[dict]:
@@ -40,7 +41,8 @@ def adherence(checkpoints: Sequence[Path], starts: int, num_inference_steps: int
     for path in checkpoints:
         trained_on = TrainPipelineConfig.from_pretrained(path).env.planning_task.gym_id
         tool_use = trained_on == "hdp/XArmToolUse-v0"
-        subject = load(path, starts, num_inference_steps, "hdp/XArmToolUseRedOnTop-v0" if tool_use else None)
+        gym_id = "hdp/XArmToolUseRedOnTop-v0" if tool_use else None
+        subject = load(path, starts, gym_id, num_inference_steps=num_inference_steps)
         if tool_use:
             prompts: Any = torch.tensor(np.stack([o["symbolic_plan"] for o in subject.observations]))
             asked, done, otherwise_good = ["RED"] * starts, "top_block", "all_stacked"
@@ -72,7 +74,7 @@ def valid_plan(checkpoints: Sequence[Path], starts: int, num_inference_steps: in
     """Success with the expert's symbolic plan given, and with none."""
     results = []
     for path in checkpoints:
-        subject = load(path, starts, num_inference_steps)
+        subject = load(path, starts, num_inference_steps=num_inference_steps)
         env, plans = subject.make_env(), []
         for seed in subject.seeds:
             env.reset(seed=seed)
@@ -92,20 +94,17 @@ def valid_plan(checkpoints: Sequence[Path], starts: int, num_inference_steps: in
 
 @dataclass
 class Candidates:
-    """Several plans for each start: (starts, k) arrays, and the seconds that one of them took.
+    """Several plans for each start: (starts, k) arrays.
 
     Attributes:
         success: whether the executed plan succeeded.
         scores: the model's score of the plan.
         complaints: how many the task's checker has about its symbols.
-        plan_s, score_s: seconds to make and to score a plan.
     """
 
     success: np.ndarray
     scores: torch.Tensor
     complaints: np.ndarray
-    plan_s: float
-    score_s: float
 
     def best_of(self, k: int, checked: bool) -> dict[str, Any]:
         """Success of the best of k. All groups of k count, so that a small k rests on as many plans as a large one."""
@@ -124,35 +123,40 @@ def draw_candidates(subject: Subject, number: int) -> Candidates:
     """Make, score, check and execute a number of plans for each start."""
     task = subject.make_env().unwrapped.planning_task
     success, scores, complaints = [], [], []
-    plan_s = score_s = 0.0
     torch.manual_seed(0)
     for i, seed in enumerate(subject.seeds):
         inputs = {key: value[i : i + 1].expand(number, -1) for key, value in subject.inputs.items()}
-        begin = time.perf_counter()
         plan = subject.policy.plan(inputs, num_candidates=1)
-        made = time.perf_counter()
         scores.append(subject.policy.score(inputs, plan).cpu())
-        score_s += time.perf_counter() - made
-        plan_s += made - begin
         complaints.append([len(task.check_plan(plan.symbols(j), subject.observations[i])) for j in range(number)])
         outcomes = execute(subject, subject.postprocessor(plan.actions).numpy(), [seed] * number)
         success.append([outcome["is_success"] for outcome in outcomes])
-    plans = number * len(subject.seeds)
-    return Candidates(np.array(success), torch.stack(scores), np.array(complaints), plan_s / plans, score_s / plans)
+    return Candidates(np.array(success), torch.stack(scores), np.array(complaints))
+
+
+def seconds_per_plan(subject: Subject, k: int) -> float:
+    """Median time to plan for one start with k candidates."""
+    seconds = []
+    for i in range(TIMED_STARTS):
+        inputs = {key: value[i : i + 1] for key, value in subject.inputs.items()}
+        begin = time.perf_counter()
+        subject.policy.plan(inputs, num_candidates=k)
+        seconds.append(time.perf_counter() - begin)
+    return float(np.median(seconds))
 
 
 def candidates(checkpoints: Sequence[Path], starts: int, num_inference_steps: int | None) -> list[dict]:
     """Success of the best of k plans, by the model's own likelihood, and by the task's checker before it."""
     results = []
     for path in checkpoints:
-        subject = load(path, starts, num_inference_steps)
+        subject = load(path, starts, num_inference_steps=num_inference_steps)
         drawn = draw_candidates(subject, max(CANDIDATES))
         best_of = [
             {
                 "k": k,
                 "by_likelihood": drawn.best_of(k, checked=False),
                 "by_checker": drawn.best_of(k, checked=True),
-                "seconds_per_plan": round(k * (drawn.plan_s + (drawn.score_s if k > 1 else 0.0)), 4),
+                "seconds_per_plan": round(seconds_per_plan(subject, k), 4),
             }
             for k in CANDIDATES
         ]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from .machine import RESULTS
-from .pages import DOCS, markdown_table
+from .pages import DOCS, LABELS, markdown_table
 
 PAGE = DOCS / "conditioning.md"
 HEADING = "## Measured\n"
@@ -23,8 +23,10 @@ def percent(measured: dict[str, Any]) -> str:
 
 
 def adherence_rows(result: dict[str, Any]) -> list[list[str]]:
-    cells = [result["planner"], *(percent(result[name]["adherence"]) for name in ("with_prompt", "without_prompt"))]
-    return [[*cells, str(result["with_prompt"]["adherence"]["of"]), str(result["network_calls_per_plan"])]]
+    measured = [result[name] for name in ("with_prompt", "without_prompt")]
+    adheres = [f"{percent(way['adherence'])} of {way['adherence']['of']}" for way in measured]
+    counts = [f"{100 * way['adherence']['of'] / result['starts']:.1f} %" for way in measured]
+    return [[LABELS[result["planner"]], *adheres, *counts, str(result["network_calls_per_plan"])]]
 
 
 def valid_plan_rows(result: dict[str, Any]) -> list[list[str]]:
@@ -45,7 +47,14 @@ def _name(result: dict[str, Any]) -> str:
     return f"{result['task'].removesuffix('-v0')}{f', {blocks} blocks' if blocks else ''}"
 
 
-ADHERENCE = ("planner", "asked for, with the prompt", "without", "plans that count", "network calls")
+ADHERENCE = (
+    "planner",
+    "does what the prompt asks for, with the prompt",
+    "without it",
+    "plans that count, with the prompt",
+    "without it",
+    "network calls",
+)
 TABLES = (
     ("adherence_XArmToolUseRedOnTop", "P(red on top, given that all are stacked); the prompt: red last", ADHERENCE),
     ("adherence_BlockSorting2D", "P(the named block is moved first, given success); the prompt: that block", ADHERENCE),
@@ -78,7 +87,11 @@ def table(file: str, title: str, header: Sequence[str]) -> str:
 
 def main() -> None:
     before = PAGE.read_text().split(HEADING)[0]
-    note = "95 % intervals are Wilson's; the same starts in every column of a table.\n"
+    note = (
+        "95 % intervals are Wilson's; the same starts in every column of a table, one training of each planner. The "
+        "checkpoints are those of `python -m benchmarks.paper --preset mini` (in the middle of learning, see "
+        "[results](results.md)).\n"
+    )
     PAGE.write_text("\n".join([before + HEADING, note, *(table(*arguments) for arguments in TABLES)]))
 
 

@@ -88,29 +88,27 @@ def load_policy(path: Path, **options: Any) -> tuple[PreTrainedPolicy, Any, Any]
 
     Args:
         path: a `pretrained_model` folder.
-        options: fields of the policy's configuration to be set otherwise.
+        options: fields of the policy's configuration to be set otherwise; None leaves a field as it is.
     """
     config = PreTrainedConfig.from_pretrained(path)
     for name, value in options.items():
-        setattr(config, name, value)
+        if value is not None:
+            setattr(config, name, value)
     policy = get_policy_class(config.type).from_pretrained(path, config=config)
     device = {"device_processor": {"device": config.device}}
     return policy, *make_pre_post_processors(config, str(path), preprocessor_overrides=device)
 
 
-def load(
-    path: Path, starts: int, num_inference_steps: int | None = None, gym_id: str | None = None, first_seed: int = 0
-) -> Subject:
+def load(path: Path, starts: int, gym_id: str | None = None, first_seed: int = 0, **options: Any) -> Subject:
     """Load a checkpoint and reset its task (or another one) to some seeds.
 
     Args:
         path: a `pretrained_model` folder.
         starts: number of seeds. Demonstrations were recorded from seeds of 32 random bits.
-        num_inference_steps: network calls for a plan; None: as in the checkpoint.
         gym_id: a task with the parameters of the one that the checkpoint was trained for.
         first_seed: the others follow it.
+        options: see `load_policy`.
     """
-    options = {"num_inference_steps": num_inference_steps} if num_inference_steps else {}
     policy, preprocessor, postprocessor = load_policy(path, **options)
     task = TrainPipelineConfig.from_pretrained(path).env.planning_task
     gym_id = gym_id or task.gym_id
@@ -184,15 +182,16 @@ def rate(hits: Sequence[bool]) -> dict[str, Any]:
     return {"rate": round(np.mean(hits), 4), "interval_95": wilson_interval(sum(hits), len(hits)), "of": len(hits)}
 
 
-def evaluate(path: Path, starts: int, first_seed: int) -> dict[str, Any]:
+def evaluate(path: Path, starts: int, first_seed: int, **options: Any) -> dict[str, Any]:
     """Success and mean score of a checkpoint; of the failures how many had a valid symbolic plan, and how these failed.
 
     Args:
         path: a `pretrained_model` folder.
         starts: fresh starts of the task that it was trained for.
         first_seed: of the starts.
+        options: see `load_policy`.
     """
-    subject = load(path, starts, first_seed=first_seed)
+    subject = load(path, starts, first_seed=first_seed, **options)
     plans = make_plans(subject)
     outcomes = execute(subject, plans.motions, subject.seeds)
     result = {

@@ -2,19 +2,42 @@
 
 python -m benchmarks.planner_comparison              # runs what is missing, then writes the table and the plot
 python -m benchmarks.planner_comparison --report     # only writes the table and the plot (needs the extra `benchmarks`)
+python -m benchmarks.planner_comparison --samplers   # the last checkpoints again, with each sampler; then the same
 
 These are the cells of two blocks and three of `python -m benchmarks.paper --preset mini mini_epsilon` (`--list` says
 which are finished): predicting the clean motion, as the `default` preset does, and the noise, as the paper does.
 """
 
 import argparse
+import json
+from typing import Any
 
-from .cells import run_cells
+from .cells import FIRST_EVALUATION_SEED, Cell, run_cells
+from .evaluation import evaluate
+from .machine import describe_run
 from .paper.presets import METHODS, make_cells
-from .planner_report import write_report
+from .planner_report import SAMPLERS_FILE, write_report
 
 PRESETS = ("mini", "mini_epsilon")
 TASKS = ("block_sorting_2d_2_blocks", "block_sorting_2d_3_blocks")
+SAMPLERS = {"hdp": ("confidence", "ddim", "ddpm")}
+"""Of the samplers, two differ for a planner without masked symbols."""
+OTHERS_SAMPLERS = ("ddim", "ddpm")
+
+
+def compare_samplers(cells: list[Cell]) -> None:
+    """Evaluate the last checkpoint of each cell with each sampler, at the starts of its own last evaluation."""
+    run, results = describe_run(), []
+    for cell in cells:
+        planner = cell.policy["type"]
+        for sampler in SAMPLERS.get(planner, OTHERS_SAMPLERS):
+            checkpoint = cell.folder / "train" / "checkpoints" / "last" / "pretrained_model"
+            first_seed = FIRST_EVALUATION_SEED + (cell.evaluations - 1) * cell.starts
+            result: dict[str, Any] = {"planner": planner, "seed": cell.seed, "sampler": sampler}
+            results.append(result | evaluate(checkpoint, cell.starts, first_seed, sampler=sampler))
+            print(json.dumps(results[-1]), flush=True)
+    facts = {"preset": cells[0].facts["preset"], "task": cells[0].facts["task_name"], "starts": cells[0].starts}
+    SAMPLERS_FILE.write_text(json.dumps({"run": run, **facts, "results": results}, indent=2) + "\n")
 
 
 def main() -> None:
@@ -22,9 +45,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--processes", type=int, default=1, help="cells at a time, which share the cores")
     parser.add_argument("--report", action="store_true")
+    parser.add_argument("--samplers", action="store_true")
     options = parser.parse_args()
     cells = make_cells(PRESETS, TASKS, METHODS, options.seeds)
-    if not options.report:
+    if options.samplers:
+        compare_samplers(make_cells([PRESETS[0]], [TASKS[1]], METHODS, options.seeds))
+    elif not options.report:
         run_cells(cells, options.processes)
     write_report(cells)
 

@@ -169,7 +169,8 @@ class XArmToolUseRedOnTopEnv(XArmToolUseEnv):
     """Tool use in which the observation asks for a plan's end, `STACK RED`.
 
     Observation: beside the others `symbolic_plan` (15,) int64, a plan prompt of token ids in which OPEN (-1) leaves
-    a token to the planner. The score is 1 when all blocks are stacked and red is on top, else 0.
+    a token to the planner. It speaks of the plan of the whole episode, and is the same at every step: for planners that
+    plan once. The score is 1 when all blocks are stacked and red is on top, else 0.
     """
 
     def __init__(self, robot: str = "primitive", **kwargs: Any):

@@ -2,6 +2,6 @@
 
 from .configuration_hdp import HDPConfig
 from .plan import Plan, PlanPrompt
-from .vocabulary import FREE, Vocabulary
+from .vocabulary import FREE, FREE_SYMBOL, Vocabulary
 
-__all__ = ["FREE", "HDPConfig", "Plan", "PlanPrompt", "Vocabulary"]
+__all__ = ["FREE", "FREE_SYMBOL", "HDPConfig", "Plan", "PlanPrompt", "Vocabulary"]

@@ -17,7 +17,7 @@ PARTIAL_MOTION_CANDIDATES = 8
 each step, so that a plan may have taken its course before that part can be seen (Trippe et al. 2023, "Diffusion
 probabilistic modeling of protein backbones in 3D for the motif-scaffolding problem"); such a plan scores low."""
 NOISE_SEED = 0
-"""Every call of `score_plans` draws the same noise: candidates differ by what they are, not by their luck."""
+"""`score_plans` has the same noise for every plan: candidates differ by what they are, not by their luck."""
 
 
 @torch.no_grad()
@@ -42,12 +42,13 @@ def score_plans(
     """
     generator = Generator(motion.device).manual_seed(NOISE_SEED)
     one = torch.ones(len(motion), device=motion.device)
-    symbols = symbol_process.corrupt(tokens, one, generator) if symbol_process and tokens is not None else None
+    symbols = symbol_process.corrupt(tokens, one) if symbol_process and tokens is not None else None
     hidden = symbols.value if symbols else None
 
     loss = torch.zeros_like(one)
     for level in MOTION_LEVELS:
-        noisy = motion_process.corrupt(motion, level * one, generator)
+        noise = torch.randn(motion.shape[1:], device=motion.device, generator=generator).expand_as(motion)
+        noisy = motion_process.add_noise(motion, noise, level * one)
         prediction = denoise(noisy.value, hidden, level * one, one)
         loss += motion_process.loss(prediction.motion, noisy) / len(MOTION_LEVELS)
     if symbol_process and symbols:

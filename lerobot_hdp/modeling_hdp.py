@@ -21,7 +21,7 @@ from .plan import Plan, PlanCheck, PlanPrompt
 from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess, Process, SymbolProcess
 from .prompt import choose_placement, encode_prompt, shared_tokens
 from .sampling import Denoise, DenoisingState, sample_plan
-from .vocabulary import FREE, Vocabulary
+from .vocabulary import FREE, FREE_SYMBOL, PAD_ID, Vocabulary
 
 
 class Planner(nn.Module):
@@ -180,7 +180,8 @@ class HDPPolicy(PreTrainedPolicy):
 
         Args:
             batch: preprocessed observations.
-            prompt: the part of the plan that is given, see `read_prompt`.
+            prompt: the part of the plan that is given, see `read_prompt`. Each candidate draws places of its own for
+                words that say none.
             generator: source of all randomness; None: PyTorch's global one.
             on_step: sees the half-done plan after each step, and all candidates of it: those of one observation follow
                 each other.
@@ -190,21 +191,28 @@ class HDPPolicy(PreTrainedPolicy):
             check: the task's checker. The candidates with the fewest complaints are preferred to all others.
 
         Raises:
-            ValueError: an observation with NaN or infinity, or a prompt that does not fit.
+            ValueError: an observation with NaN or infinity, a prompt that does not fit, or a checker with nothing to
+                choose from.
         """
-        prompt = self.read_prompt(batch, prompt, generator)
         k = num_candidates
         if k is None:
-            partial = prompt.gives_part_of_motion and self.can_score
+            partial = isinstance(prompt, PlanPrompt) and prompt.gives_part_of_motion and self.can_score
             k = max(self.config.num_candidates, PARTIAL_MOTION_CANDIDATES if partial else 1)
         if k < 1:
             raise ValueError(f"num_candidates must be at least 1, got {k}")
         if k == 1:
-            return self._sample(batch, prompt, generator, on_step)
+            if check is not None:
+                raise ValueError("a checker chooses among candidates: set num_candidates to more than 1")
+            return self._sample(batch, self.read_prompt(batch, prompt, generator), generator, on_step)
 
-        repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in self.config.input_features}
-        plans = self._sample(repeated, prompt.repeat(k), generator, on_step)
-        scores = torch.stack([self.score(batch, plans.select(slice(i, None, k))) for i in range(k)], dim=1)
+        inputs = [key for key in (*self.config.input_features, OBS_SYMBOLIC_PLAN) if key in batch]
+        repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in inputs}
+        if isinstance(prompt, PlanPrompt):
+            prompt = prompt.repeat(k)
+        elif prompt is not None and not isinstance(prompt, str):
+            prompt = [text for text in prompt for _ in range(k)]
+        plans = self._sample(repeated, self.read_prompt(repeated, prompt, generator), generator, on_step)
+        scores = self.score(repeated, plans).unflatten(0, (-1, k))
         complaints = None
         if check is not None:
             about = plans.validate(lambda index, symbols: check(index // k, symbols))
@@ -236,7 +244,8 @@ class HDPPolicy(PreTrainedPolicy):
         """What is given of each plan of a batch.
 
         It comes from the argument, else from the configuration (`--policy.prompt`), else from the environment, in
-        `observation.symbolic_plan`. Where words do not say their place in the plan ("... STACK red"), the planner
+        `observation.symbolic_plan`. In a batch of a dataset that column is the recorded plan: give "" to plan freely
+        from one. Where words do not say their place in the plan ("... STACK red"), the planner
         draws one, by one call of the network.
 
         Args:
@@ -275,13 +284,16 @@ class HDPPolicy(PreTrainedPolicy):
         if all(len(ways) == 1 for ways in placements):
             return torch.cat(placements)
         if not isinstance(self.symbol_process, MaskedProcess):
-            raise ValueError("this planner cannot place words after '...': number their positions, as in 11:STACK")
+            raise ValueError(
+                "this planner cannot decide where in a plan words stand, after '...' or from its end: number their "
+                "positions from the start, as in 11:STACK"
+            )
         # The most corrupted plan, with what is given in any case: its symbols' probabilities are those of the places.
         given = torch.stack([shared_tokens(ways) for ways in placements])
-        tokens = given.masked_fill(given == FREE, self.symbol_process.mask_id)
+        tokens = given.masked_fill(given < PAD_ID, self.symbol_process.mask_id)
         motion = self.motion_process.prior(self._motion_shape(batch), self._device, generator)
         k_c = torch.ones(len(texts), device=self._device)
-        logits = self._denoiser(batch)(motion, tokens, k_c, (given == FREE).float().mean(dim=1)).symbols
+        logits = self._denoiser(batch)(motion, tokens, k_c, (given < PAD_ID).float().mean(dim=1)).symbols
         drawn = zip(placements, logits, strict=True)
         return torch.stack([choose_placement(ways, scores, generator) for ways, scores in drawn])
 
@@ -305,7 +317,7 @@ class HDPPolicy(PreTrainedPolicy):
             generator,
             on_step,
         )
-        return Plan(motion, tokens, probabilities, self.vocabulary)
+        return Plan(motion, tokens, probabilities, self.vocabulary, prompt.tokens_mask)
 
     def _denoiser(self, batch: dict[str, Tensor]) -> Denoise:
         """The denoiser for the observations of a batch."""
@@ -352,15 +364,20 @@ class HDPPolicy(PreTrainedPolicy):
         return self._batch_size(batch), self.config.horizon, self.config.action_feature.shape[0]
 
     def _check_prompt(self, prompt: PlanPrompt, batch_size: int) -> None:
+        shape = batch_size, self.config.horizon, self.config.action_feature.shape[0]
         if prompt.token_ids is not None:
             if self.symbol_process is None:
                 raise ValueError("this planner models no symbols: it takes no symbolic prompt")
-            expected = (batch_size, self.config.symbolic_horizon)
-            if tuple(prompt.token_ids.shape) != expected:
-                raise ValueError(f"token_ids must have the shape {expected}, got {tuple(prompt.token_ids.shape)}")
-        expected = (batch_size, self.config.horizon, self.config.action_feature.shape[0])
-        if prompt.actions is not None and tuple(prompt.actions.shape) != expected:
-            raise ValueError(f"actions must have the shape {expected}, got {tuple(prompt.actions.shape)}")
+            _check_tensor("token_ids", prompt.token_ids, (batch_size, self.config.symbolic_horizon), torch.int64)
+            size = len(self.config.vocabulary)
+            if ((prompt.token_ids < FREE_SYMBOL) | (prompt.token_ids >= size)).any():
+                raise ValueError(f"token_ids must be in [0, {size - 1}], or {FREE} or {FREE_SYMBOL}, see PlanPrompt")
+        if prompt.actions is not None:
+            _check_tensor("actions", prompt.actions, shape, torch.float32)
+            if not prompt.actions.isfinite().all():
+                raise ValueError("actions hold NaN or infinity")
+        if prompt.actions_given is not None:
+            _check_tensor("actions_given", prompt.actions_given, shape[:2], torch.bool)
 
     @classmethod
     def _load_as_safetensor(cls, model: "HDPPolicy", model_file: str, map_location: str, strict: bool) -> "HDPPolicy":
@@ -402,6 +419,13 @@ def _moving_average(network: nn.Module, config: HDPConfig) -> AveragedModel:
 def _seed(*numbers: int) -> int:
     """A seed that follows from some numbers."""
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+
+
+def _check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    if tuple(tensor.shape) != shape or tensor.dtype != dtype:
+        raise ValueError(
+            f"{name} must have the shape {shape} and the type {dtype}, got {tuple(tensor.shape)} and {tensor.dtype}"
+        )
 
 
 def _rank_and_world_size() -> tuple[int, int]:

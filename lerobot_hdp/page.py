@@ -80,7 +80,7 @@ def write_page(page: PlanPage, path: Path) -> None:
         "given": list(page.given),
         "steps": _steps(len(final.words), page.step_ends),
     }
-    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(TEMPLATE.read_text(encoding="utf-8").replace("PLAN_DATA;", text + ";"), encoding="utf-8")
 

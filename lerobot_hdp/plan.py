@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .vocabulary import FREE, Vocabulary
+from .vocabulary import FREE_SYMBOL, PAD_ID, Vocabulary
 
 PlanCheck = Callable[[int, list[str]], list[str]]
 """(index of the sample, its plan in words) -> complaints about the plan, in words; none about a valid one."""
@@ -23,7 +23,8 @@ class PlanPrompt:
     """The part of a plan that is given; the planner finds the rest.
 
     Attributes:
-        token_ids: (B, H_d) int64 token ids, FREE (-1) where the planner decides. None: all symbols are free.
+        token_ids: (B, H_d) int64 token ids, FREE (-1) where the planner decides, FREE_SYMBOL (-2) where it decides
+            among the symbols other than PAD. None: all symbols are free.
         actions: (B, H_c, D) normalised actions. None: the whole motion is free.
         actions_given: (B, H_c) bool, which of `actions` are given. None: all of them.
     """
@@ -39,7 +40,15 @@ class PlanPrompt:
     @property
     def tokens_mask(self) -> Tensor | None:
         """(B, H_d) bool, which tokens are given; None: none of them."""
-        return None if self.token_ids is None else self.token_ids != FREE
+        return None if self.token_ids is None else self.token_ids >= PAD_ID
+
+    @property
+    def not_pad(self) -> Tensor | None:
+        """(B, H_d) bool, where no PAD may be drawn, which only fills the end of a plan; None: it may be anywhere."""
+        if self.token_ids is None:
+            return None
+        given_from_here_on = (self.token_ids >= PAD_ID).flip(1).cummax(dim=1).values.flip(1)
+        return given_from_here_on | (self.token_ids == FREE_SYMBOL)
 
     @property
     def actions_mask(self) -> Tensor | None:
@@ -52,8 +61,10 @@ class PlanPrompt:
 
     @property
     def gives_part_of_motion(self) -> bool:
-        """Whether some actions are given, but not all."""
-        return self.actions_given is not None and bool(self.actions_given.any()) and not self.actions_given.all()
+        """Whether, in any sample, some actions are given, but not all."""
+        if self.actions_given is None:
+            return False
+        return bool((self.actions_given.any(dim=1) & ~self.actions_given.all(dim=1)).any())
 
     def repeat(self, times: int) -> "PlanPrompt":
         """Each sample's prompt `times` times, one after the other: (B times, ...)."""
@@ -81,6 +92,7 @@ class Plan:
         token_probabilities: (B, H_d) the probability with which each token was drawn; 1 where it was given. (B, 0)
             from a planner that draws none: it models no symbols, or continuous ones.
         vocabulary: what the token ids mean.
+        tokens_given: (B, H_d) bool, which tokens the prompt gave; None: none of them.
         scores: (B,) the score by which the plan was kept (`candidates.score_plans`); None: there was no choice.
         candidate: (B,) the number of the candidate that was kept; None: there was no choice.
     """
@@ -89,6 +101,7 @@ class Plan:
     token_ids: Tensor | None = None
     token_probabilities: Tensor | None = None
     vocabulary: Vocabulary | None = None
+    tokens_given: Tensor | None = None
     scores: Tensor | None = None
     candidate: Tensor | None = None
 

@@ -16,7 +16,7 @@ from lerobot.processor.factory import make_default_policy_processor_steps, make_
 from torch import Tensor
 
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
-from .vocabulary import FREE
+from .vocabulary import FREE_SYMBOL
 
 
 @ProcessorStepRegistry.register(name="hdp_symbolic_plan")
@@ -44,7 +44,7 @@ class SymbolicPlanProcessorStep(ObservationProcessorStep):
             plan = plan.unsqueeze(0)
         if plan.shape[1] > self.symbolic_horizon:
             raise ValueError(f"a plan of {plan.shape[1]} tokens is longer than {self.symbolic_horizon=}")
-        unknown = (plan < FREE) | (plan >= self.vocabulary_size)
+        unknown = (plan < FREE_SYMBOL) | (plan >= self.vocabulary_size)
         if unknown.any():
             raise ValueError(
                 f"{OBS_SYMBOLIC_PLAN} holds the token id {plan[unknown][0].item()}, which is none of the "

@@ -1,7 +1,7 @@
 """The language of prompts: a part of a plan in words. docs/conditioning.md is its manual.
 
     PICK A           the plan begins so; what follows is open
-    PICK _ S1        `_` is one position that the planner decides
+    PICK _ S1        `_` is one symbol that the planner decides
     ... STACK red    `...` is any number of them, also none: the plan ends with STACK red
     PICK A ... S3    it begins with PICK A and ends with S3
     ... AUX ...      AUX is somewhere
@@ -22,7 +22,7 @@ from itertools import islice
 import torch
 from torch import Generator, Tensor
 
-from .vocabulary import FREE, Vocabulary
+from .vocabulary import FREE, FREE_SYMBOL, PAD_ID, Vocabulary
 
 FREE_WORD = "_"
 ANY_NUMBER = "..."
@@ -37,44 +37,54 @@ class Part:
     """Words of a prompt that follow each other without a gap.
 
     Attributes:
-        ids: a token id, or FREE, for each word.
+        ids: a token id, or FREE_SYMBOL, for each word; without PAD.
         start: the first word's position, from 0; negative: from the end of the plan; None: anywhere after the part
             before.
+        said: its first word, and where in the prompt that stands.
+        ends: whether the plan ends with it, as PAD says.
     """
 
     ids: list[int]
     start: int | None
+    said: str
+    ends: bool = False
 
 
 def encode_prompt(prompt: str, vocabulary: Vocabulary, length: int) -> Tensor:
     """All ways to place a prompt in a plan of up to `length` symbols: (C, length) int64, C >= 1.
 
-    Each is a row of token ids, FREE where the planner decides, PAD from the end of the plan on where the prompt says
-    how the plan ends.
+    Each is a row of token ids, FREE where the planner decides, FREE_SYMBOL where it decides on anything but PAD, and
+    PAD from the end of the plan on where the prompt says how the plan ends.
 
     Raises:
         ValueError: an unknown symbol, an impossible position, or a prompt that does not fit.
 
     Example:
         >>> encode_prompt("PICK _ S1", Vocabulary(["PAD", "A", "PICK", "S1"]), length=4)
-        tensor([[ 2, -1,  3, -1]])
+        tensor([[ 2, -2,  3, -1]])
         >>> encode_prompt("... S1", Vocabulary(["PAD", "A", "PICK", "S1"]), length=3)
         tensor([[ 3,  0,  0],
-                [-1,  3,  0],
-                [-1, -1,  3]])
+                [-2,  3,  0],
+                [-2, -2,  3]])
     """
     parts = _parse(prompt, vocabulary)
-    rows = list(islice(_placements(parts, length, vocabulary.pad_id), MAX_PLACEMENTS + 1))
+    for part in parts:
+        if part.start is not None and not -length <= part.start < length + part.ends:
+            raise ValueError(f"{part.said} is outside of a plan of {length} symbols")
+    ways = list(islice(_placements(parts, length), 10 * MAX_PLACEMENTS + 1))
+    rows = list(dict.fromkeys(ways))
     if not rows:
+        fits = (any(_placements(parts[: number + 1], length)) for number in range(len(parts)))
+        said = next(part.said for part, fit in zip(parts, fits, strict=True) if not fit)
         raise ValueError(
-            f"the prompt '{prompt}' does not fit into a plan of {length} symbols: it is too long, names a position "
-            "outside of it, or its parts overlap or are out of order"
+            f"the prompt '{prompt}' does not fit into a plan of {length} symbols: there is no room for what begins "
+            f"with {said}, after what comes before it"
         )
-    if len(rows) > MAX_PLACEMENTS:
+    if len(ways) > 10 * MAX_PLACEMENTS or len(rows) > MAX_PLACEMENTS:
         raise ValueError(
             f"the prompt '{prompt}' can be placed in too many ways: give positions by number, as in 7:PICK"
         )
-    return torch.tensor(list(dict.fromkeys(rows)))
+    return torch.tensor(rows)
 
 
 def shared_tokens(placements: Tensor) -> Tensor:
@@ -94,76 +104,83 @@ def choose_placement(placements: Tensor, logits: Tensor, generator: Generator | 
         logits: (H, m) scores of the symbols, with the shared tokens given.
         generator: source of randomness; None: PyTorch's global one.
     """
-    is_pad = placements == 0
+    is_pad = placements == PAD_ID
     after_first_pad = is_pad & is_pad.roll(1, dims=1)
     after_first_pad[:, 0] = False
-    counted = (placements != FREE) & (shared_tokens(placements) == FREE) & ~after_first_pad
+    counted = (placements >= PAD_ID) & (shared_tokens(placements) < PAD_ID) & ~after_first_pad
     log_probabilities = logits.float().log_softmax(dim=-1)[torch.arange(len(logits)), placements.clamp(min=0)]
     scores = torch.where(counted, log_probabilities, 0.0).sum(dim=1)
     return placements[torch.multinomial(scores.softmax(dim=0), 1, generator=generator).item()]
 
 
 def _parse(prompt: str, vocabulary: Vocabulary) -> list[Part]:
-    """The parts of a prompt that give at least one symbol, in order."""
+    """The parts of a prompt, in order."""
     spaced = re.sub(r"\.\.\.|…", f" {ANY_NUMBER} ", prompt)
     words = re.sub(r"(?<=\d)\s*:\s*", ":", spaced).split()
     parts: list[Part] = []
     start: int | None = 0  # of the next part
     begins = True  # whether the next word begins a part
     for place, word in enumerate(words, start=1):
+        where = f"(word {place} of the prompt)"
+        said = f"'{word}' {where}"
         if word == ANY_NUMBER:
             start, begins = None, True
             continue
         numbered = re.fullmatch(r"([+-]?\d+):(.+)", word)
         if numbered:
-            start, begins = _position(int(numbered[1]), word, place), True
+            start, begins = _position(int(numbered[1]), said), True
             word = numbered[2]
-        symbol = _token_id(word, place, vocabulary)
-        if symbol is None:
+            if word == ANY_NUMBER:
+                raise ValueError(f"{said}: a position is that of a symbol, or of '{FREE_WORD}'")
+        token = _token_id(word, where, vocabulary)
+        if token is None:
             continue
         if begins:
-            parts.append(Part([], start))
+            parts.append(Part([], start, said))
             begins = False
-        parts[-1].ids.append(symbol)
-    if parts and parts[-1].start is None and not begins:
+        if token == PAD_ID:
+            parts[-1].ends = True
+        elif any(part.ends for part in parts):
+            raise ValueError(f"{said} comes after {vocabulary.symbols[PAD_ID]}, where the plan has ended")
+        else:
+            parts[-1].ids.append(token)
+    if parts and parts[-1].start is None and parts[-1].ids and (not begins or parts[-1].ends):
         parts[-1].start = -len(parts[-1].ids)
-    return [part for part in parts if any(token != FREE for token in part.ids)]
+    return parts
 
 
-def _position(number: int, word: str, place: int) -> int:
+def _position(number: int, said: str) -> int:
     """A position as it is written, 1, 2, ... or ..., -2, -1, as an index."""
     if number == 0:
-        raise ValueError(f"'{word}' (word {place} of the prompt): positions count from 1, or from the end from -1")
+        raise ValueError(f"{said}: positions count from 1, or from the end from -1")
     return number - 1 if number > 0 else number
 
 
-def _token_id(word: str, place: int, vocabulary: Vocabulary) -> int | None:
-    """The token id of a word, FREE, or None for a filler word."""
+def _token_id(word: str, where: str, vocabulary: Vocabulary) -> int | None:
+    """The token id of a word, FREE_SYMBOL, or None for a filler word."""
     if word == FREE_WORD:
-        return FREE
+        return FREE_SYMBOL
     if word in vocabulary:
         return vocabulary.token_id(word)
     if word.upper() in FILLER_WORDS:
         return None
     raise ValueError(
-        f"unknown symbol '{word}' (word {place} of the prompt); the symbols are {' '.join(vocabulary.symbols)}, "
+        f"unknown symbol '{word}' {where}; the symbols are {' '.join(vocabulary.symbols)}, "
         f"'{FREE_WORD}' leaves one open and '{ANY_NUMBER}' any number"
     )
 
 
-def _placements(parts: Sequence[Part], length: int, pad_id: int) -> Iterator[tuple[int, ...]]:
+def _placements(parts: Sequence[Part], length: int) -> Iterator[tuple[int, ...]]:
     """Rows of token ids, one for each way to place the parts; some may come twice."""
     says_the_end = any(part.start is not None and part.start < 0 for part in parts)
     for plan_length in range(1, length + 1) if says_the_end else (length,):
         for starts in _starts(parts, 0, plan_length):
-            row = [FREE] * plan_length + [pad_id] * (length - plan_length)
+            row = [FREE_SYMBOL if says_the_end else FREE] * plan_length + [PAD_ID] * (length - plan_length)
             for part, start in zip(parts, starts, strict=True):
-                row[start : start + len(part.ids)] = part.ids
-            if pad_id in row:
-                end = row.index(pad_id)
-                if any(token not in (FREE, pad_id) for token in row[end:]):
-                    continue
-                row[end:] = [pad_id] * (length - end)
+                stop = start + len(part.ids)
+                row[start:stop] = part.ids
+                if part.ends:
+                    row[stop:] = [PAD_ID] * (length - stop)
             yield tuple(row)
 
 
@@ -178,6 +195,8 @@ def _starts(parts: Sequence[Part], earliest: int, plan_length: int) -> Iterator[
     else:
         start = part.start if part.start >= 0 else plan_length + part.start
         choices = range(start, start + 1)
+        if part.ends and part.start < 0 and start + size != plan_length:
+            return
     for start in choices:
         if earliest <= start <= plan_length - size:
             for others in _starts(parts[1:], start + size, plan_length):

@@ -11,6 +11,7 @@ from .denoiser import Prediction
 from .plan import PlanPrompt
 from .processes import GaussianProcess, MaskedProcess, Process, SymbolProcess
 from .processes.base import expand_to
+from .vocabulary import PAD_ID
 
 Denoise = Callable[[Tensor, Tensor | None, Tensor, Tensor], Prediction]
 """(motion (B, H_c, D), symbols (B, H_d, ...), k_c (B,), k_d (B,)) -> Prediction, for a fixed observation."""
@@ -38,10 +39,11 @@ class Stream:
     Attributes:
         process: the process.
         value: (B, H, ...) where it is.
-        levels: (num_steps + 1,) the levels it passes; all 0 where everything is given (k = 0).
+        levels: (num_steps + 1,) the levels it passes.
         clean: the given part; None: nothing is given.
         given: broadcastable against `clean`, bool, which of it is given.
-        shared_level: the levels are those of the other process, too, and stay what they are.
+        shared_level: the levels are those of the other process, too, and stay what they are where everything is given.
+            Otherwise a sample of which everything is given stays clean (k = 0).
     """
 
     process: Process
@@ -52,13 +54,14 @@ class Stream:
     shared_level: bool = False
 
     def __post_init__(self):
-        self.all_given = self.given is not None and bool(self.given.all()) and not self.shared_level
-        if self.all_given:
-            self.levels = torch.zeros_like(self.levels)
+        if self.given is None or self.shared_level:
+            self.all_given = torch.zeros(len(self.value), dtype=torch.bool, device=self.value.device)
+        else:
+            self.all_given = self.given.flatten(1).all(dim=1)
 
     def level(self, step: int) -> Tensor:
         """The level before a step, as the denoiser is told of it: (B,)."""
-        return self.process.told_level(self.value, self.levels[step])
+        return self.process.told_level(self.value, self.levels[step]).masked_fill(self.all_given, 0.0)
 
     def set_given(self, step: int, generator: Generator | None) -> None:
         """Put the given part into the value as it looks before a step."""
@@ -68,9 +71,8 @@ class Stream:
 
     def advance(self, step: int, prediction: Tensor, generator: Generator | None) -> None:
         """Take a reverse step."""
-        if not self.all_given:
-            levels = self.levels[step], self.levels[step + 1]
-            self.value = self.process.reverse_step(self.value, prediction, *levels, generator)
+        levels = self.levels[step], self.levels[step + 1]
+        self.value = self.process.reverse_step(self.value, prediction, *levels, generator)
         self.set_given(step + 1, generator)
 
 
@@ -91,8 +93,9 @@ def sample_plan(
     """Algorithm 2: denoise the motion and unmask the symbols in the same steps, each seeing the other.
 
     What the prompt gives stays fixed at every step. Given tokens are seen clean; a given action (or one-hot symbol)
-    is seen with the noise of the current level, as in training. Where all symbols or the whole motion are given, k_d
-    or k_c is 0, unless the two share one level.
+    is seen with the noise of the current level, as in training. Where all symbols or the whole motion of a sample are
+    given, its k_d or k_c is 0, unless the two share one level. PAD fills the end of a plan only: before a given token,
+    none is drawn.
 
     Args:
         denoise: the denoiser, with its observation.
@@ -136,11 +139,13 @@ def sample_plan(
         if symbols is not None:
             assert symbol_process is not None
             assert prediction.symbols is not None
-            before = symbols.value
-            symbols.advance(i, prediction.symbols, generator)
+            before, scores = symbols.value, prediction.symbols
+            if prompt.not_pad is not None and isinstance(symbol_process, MaskedProcess):
+                scores[..., PAD_ID] = scores[..., PAD_ID].masked_fill(prompt.not_pad, -torch.inf)
+            symbols.advance(i, scores, generator)
             tokens = symbol_process.tokens(symbols.value)
             if isinstance(symbol_process, MaskedProcess):
-                drawn = _token_probabilities(prediction.symbols, tokens)
+                drawn = _token_probabilities(scores, tokens)
                 probabilities = torch.where(tokens == before, probabilities, drawn)
         if on_step is not None:
             on_step(i + 1, DenoisingState(motion.value, tokens, probabilities))

@@ -1,12 +1,20 @@
 """The symbols of a plan and their token ids."""
 
+import re
 from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
 
+PAD_ID = 0
+"""Token id that fills the end of a plan that is shorter than the symbolic horizon."""
 FREE = -1
 """Token id, in a prompt, of a position that the planner decides."""
+FREE_SYMBOL = -2
+"""The same, where the plan has not ended: any symbol but PAD."""
+
+
+NAME = r"[^\s:…]+"
 
 
 class Vocabulary:
@@ -27,15 +35,16 @@ class Vocabulary:
     def __init__(self, symbols: Sequence[str]):
         if len(symbols) < 2 or len({symbol.upper() for symbol in symbols}) != len(symbols):
             raise ValueError(f"a vocabulary is PAD and at least one more symbol, each once; got {list(symbols)}")
+        for symbol in symbols:
+            if not re.fullmatch(NAME, symbol) or symbol == "_" or "..." in symbol:
+                raise ValueError(
+                    f"{symbol!r} cannot be a symbol: prompts name one by a word without spaces, ':' or '...'"
+                )
         self.symbols = tuple(symbols)
         self._ids = {symbol.upper(): i for i, symbol in enumerate(self.symbols)}
 
     def __len__(self) -> int:
         return len(self.symbols)
-
-    @property
-    def pad_id(self) -> int:
-        return 0
 
     @property
     def mask_id(self) -> int:
@@ -60,7 +69,7 @@ class Vocabulary:
         words = plan.split() if isinstance(plan, str) else list(plan)
         if len(words) > length:
             raise ValueError(f"{len(words)} symbols do not fit into a plan of {length}")
-        ids = torch.full((length,), self.pad_id, dtype=torch.int64)
+        ids = torch.full((length,), PAD_ID, dtype=torch.int64)
         for position, word in enumerate(words):
             if word not in self:
                 raise ValueError(
@@ -76,7 +85,7 @@ class Vocabulary:
             ValueError: an id that is no symbol's.
         """
         ids = [int(i) for i in ids]
-        while ids and ids[-1] == self.pad_id:
+        while ids and ids[-1] == PAD_ID:
             ids.pop()
         for position, i in enumerate(ids):
             if not 0 <= i < len(self):

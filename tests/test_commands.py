@@ -13,7 +13,9 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
-from .conftest import N_EPISODES, REPOSITORY, TASK_FLAGS, TINY_PLANNER, run_command
+from lerobot_hdp import Vocabulary
+
+from .conftest import HORIZON, N_EPISODES, REPOSITORY, TASK_FLAGS, TINY_PLANNER, run_command
 
 STEPS, SAVE_FREQ = 12, 5  # with 4 batches an epoch, the first checkpoint lies within the second epoch
 ENV_FLAGS = ("--env.type=hdp", *TASK_FLAGS)
@@ -244,14 +246,33 @@ def open_in_browser(page: Path) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
 
 
-def test_hdp_plan_explains_a_recorded_motion(checkpoint):
-    """Of the dataset in the checkpoint's training configuration."""
+def test_hdp_plan_explains_a_recorded_motion(checkpoint, dataset_root):
+    """Of the dataset in the checkpoint's training configuration. The planner is as good as untrained."""
     result = run_command("hdp-plan", f"--policy.path={checkpoint}", "--explain=2")
-    first, *_ = result.stdout[result.stdout.index("episode 2:") :].splitlines()[1:]
+    _, first, *_, last = result.stdout[result.stdout.index("episode 2:") :].splitlines()
     assert first.startswith("    waypoints 0-6 ")
-    explained = result.stdout.replace("the recorded plan says the same", "")
-    recorded = explained.partition("recorded: ")[2].split()  # an untrained planner may say the same by chance only
-    assert recorded[:1] == ["PICK"]
+    dataset = LeRobotDataset("test/sorting", root=dataset_root, video_backend="pyav")
+    vocabulary = Vocabulary(dataset.meta.features["observation.symbolic_plan"]["info"]["vocabulary"])
+    recorded = vocabulary.decode(dataset[2 * HORIZON]["observation.symbolic_plan"])
+    assert last in ("the recorded plan says the same", f"recorded: {' '.join(recorded)}")
+
+
+def test_hdp_plan_explains_a_dataset_without_symbols_and_without_a_task(checkpoint, dataset_root, tmp_path):
+    bare, policy = tmp_path / "bare", tmp_path / "policy"
+    run_command(
+        "lerobot-edit-dataset",
+        "--repo_id=test/sorting",
+        f"--root={dataset_root}",
+        "--new_repo_id=test/bare",
+        f"--new_root={bare}",
+        "--operation.type=remove_feature",
+        "--operation.feature_names=['observation.symbolic_plan']",
+    )
+    shutil.copytree(checkpoint, policy)
+    config = json.loads((policy / "train_config.json").read_text())
+    (policy / "train_config.json").write_text(json.dumps({**config, "env": None}))
+    flags = (f"--policy.path={policy}", "--dataset.repo_id=test/bare", f"--dataset.root={bare}", "--explain=2")
+    assert run_command("hdp-plan", *flags).stdout.endswith("the dataset has no symbolic plans\n")
 
 
 @pytest.mark.parametrize(
@@ -263,6 +284,18 @@ def test_hdp_plan_explains_a_recorded_motion(checkpoint):
         ),
         (["--policy.prompt=PICK D"], "unknown symbol 'D' (word 2 of the prompt)"),
         (["--prompt=" + "PICK " * 19], "does not fit into a plan of 18 symbols"),
+        (["--prompt=... PICK D ..."], "unknown symbol 'D' (word 3 of the prompt)"),
+        (["--prompt=7: PICK 3: A"], "no room for what begins with '3:A' (word 2 of the prompt)"),
+        (["--explain=0", "--prompt=PICK"], "--explain goes without --prompt"),
+        (
+            ["--explain=0", "--dataset.repo_id=no/where", "--dataset.root=outputs/none"],
+            "no/where is not in outputs/none",
+        ),
+        (
+            ["--env.type=hdp", "--env.n_blocks=3", "--env.waypoints_per_pose=1"],
+            "the planner was trained for another task: its horizon is 19, here it is 37",
+        ),
+        (["--check=true"], "set --policy.num_candidates to more than 1"),
         (["--policy.path=nowhere/to/be/found"], "nowhere/to/be/found"),
         ([f"--explain={N_EPISODES}"], f"--explain={N_EPISODES}: the dataset has the episodes 0 to {N_EPISODES - 1}"),
     ],

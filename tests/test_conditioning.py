@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gym_hdp_tasks.block_sorting_2d import block_name, slot_name
-from lerobot_hdp import PlanPrompt
+from lerobot_hdp import Plan, PlanPrompt
 from lerobot_hdp.vocabulary import Vocabulary
 
 from .conftest import SYMBOLIC_HORIZON, Trained
@@ -136,12 +136,24 @@ class TestCandidates:
         scores = [trained.policy.score(inputs, plan) for inputs in (trained.inputs, elsewhere)]
         assert (scores[0] > scores[1]).float().mean() >= 0.95
 
+    def test_the_score_of_a_plan_does_not_depend_on_what_else_is_scored(self, trained):
+        plan = trained.policy.plan(trained.inputs)
+        together = trained.policy.score(trained.inputs, plan)
+        for i in (0, 7, 39):
+            one = slice(i, i + 1)
+            alone = trained.policy.score({key: value[one] for key, value in trained.inputs.items()}, plan.select(one))
+            torch.testing.assert_close(alone, together[one], rtol=1e-3, atol=1e-5)
+
     def test_the_best_of_the_candidates_is_kept(self, trained):
         states = []
         plan = trained.policy.plan(trained.inputs, num_candidates=3, on_step=lambda _, state: states.append(state))
         candidates = states[-1].motion.reshape(40, 3, *trained.actions.shape[1:])
         assert torch.equal(plan.actions, candidates[torch.arange(40), plan.candidate])
         torch.testing.assert_close(plan.scores, trained.policy.score(trained.inputs, plan))
+        repeated = {key: value.repeat_interleave(3, dim=0) for key, value in trained.inputs.items()}
+        drawn = Plan(states[-1].motion, states[-1].tokens, vocabulary=trained.policy.vocabulary)
+        scores = trained.policy.score(repeated, drawn).reshape(40, 3)
+        assert torch.equal(plan.candidate, scores.argmax(dim=1))
         assert len(set(plan.candidate.tolist())) == 3
 
     def test_the_tasks_checker_comes_first(self, trained):

@@ -4,8 +4,9 @@ import pytest
 import torch
 from draccus.utils import ParsingError
 
-from lerobot_hdp import FREE, HDPConfig, PlanPrompt, Vocabulary
+from lerobot_hdp import FREE, FREE_SYMBOL, HDPConfig, PlanPrompt, Vocabulary
 from lerobot_hdp.prompt import choose_placement, encode_prompt, shared_tokens
+from lerobot_hdp.vocabulary import PAD_ID
 
 VOCABULARY = Vocabulary(["PAD", "RED", "GREEN", "BLUE", "DRAG", "STACK"])
 LENGTH = 6
@@ -13,7 +14,7 @@ LENGTH = 6
 
 def placements(prompt: str, vocabulary: Vocabulary = VOCABULARY, length: int = LENGTH) -> list[str]:
     """Each placement in words: `_` is free, `.` is PAD."""
-    words = dict(enumerate(vocabulary.symbols)) | {FREE: "_", vocabulary.pad_id: "."}
+    words = dict(enumerate(vocabulary.symbols)) | {FREE: "_", FREE_SYMBOL: "_", PAD_ID: "."}
     return [" ".join(words[i] for i in row) for row in encode_prompt(prompt, vocabulary, length).tolist()]
 
 
@@ -38,11 +39,25 @@ def placements(prompt: str, vocabulary: Vocabulary = VOCABULARY, length: int = L
             ["DRAG RED BLUE . . .", "DRAG RED _ BLUE . .", "DRAG RED _ _ BLUE .", "DRAG RED _ _ _ BLUE"],
         ),
         ("DRAG RED ... BLUE GREEN STACK ...", ["DRAG RED BLUE GREEN STACK _", "DRAG RED _ BLUE GREEN STACK"]),
-        ("... 5:BLUE ... PAD", ["_ _ _ _ BLUE ."]),
+        ("... 5:BLUE ... PAD", ["_ _ _ _ BLUE .", "_ _ _ _ BLUE _"]),
+        (
+            "... STACK RED PAD",
+            ["STACK RED . . . .", "_ STACK RED . . .", "_ _ STACK RED . .", "_ _ _ STACK RED .", "_ _ _ _ STACK RED"],
+        ),
+        ("DRAG RED DRAG BLUE STACK RED PAD", ["DRAG RED DRAG BLUE STACK RED"]),
+        ("5:PAD", ["_ _ _ _ . ."]),
+        ("_ ... 6:RED", ["_ _ _ _ _ RED"]),
+        ("DRAG ... _ ... -1:RED", ["DRAG _ RED . . .", "DRAG _ _ RED . .", "DRAG _ _ _ RED .", "DRAG _ _ _ _ RED"]),
+        ("4:DRAG RED ... _", ["_ _ _ DRAG RED _"]),
     ],
 )
 def test_where_the_words_of_a_prompt_may_stand(prompt, expected):
     assert placements(prompt) == expected
+
+
+def test_where_the_plan_has_not_ended_only_pad_is_excluded():
+    assert encode_prompt("DRAG _", VOCABULARY, LENGTH).tolist() == [[4, FREE_SYMBOL, FREE, FREE, FREE, FREE]]
+    assert encode_prompt("-6:DRAG", VOCABULARY, LENGTH).tolist() == [[4] + [FREE_SYMBOL] * 5]
 
 
 @pytest.mark.parametrize(
@@ -68,17 +83,28 @@ def test_filler_words_can_be_symbols():
         ),
         ("... STACK 5:re", r"unknown symbol 're' \(word 3 of the prompt\)"),
         ("0:RED", r"'0:RED' \(word 1 of the prompt\): positions count from 1"),
-        ("7:RED", "'7:RED' does not fit into a plan of 6 symbols"),
-        ("-7:RED", "does not fit"),
-        ("-1:STACK RED", "does not fit"),
-        ("RED " * 7, "does not fit"),
-        ("DRAG RED 2:BLUE", "its parts overlap or are out of order"),
-        ("PAD RED", "does not fit"),
+        ("7:RED", r"'7:RED' \(word 1 of the prompt\) is outside of a plan of 6 symbols"),
+        ("... RED 7:_", r"'7:_' \(word 3 of the prompt\) is outside"),
+        ("-7:RED", r"'-7:RED' \(word 1 of the prompt\) is outside"),
+        ("-1:STACK RED", r"no room for what begins with '-1:STACK' \(word 1"),
+        ("-2:STACK PAD", r"no room for what begins with '-2:STACK' \(word 1"),
+        ("RED " * 7, r"no room for what begins with 'RED' \(word 1"),
+        ("_ " * 7, r"no room for what begins with '_' \(word 1"),
+        ("DRAG RED 2:BLUE STACK", r"no room for what begins with '2:BLUE' \(word 3"),
+        ("DRAG ... 3:RED 1:BLUE", r"no room for what begins with '1:BLUE' \(word 4"),
+        ("DRAG PAD RED", r"'RED' \(word 3 of the prompt\) comes after PAD, where the plan has ended"),
+        ("2:...", r"'2:\.\.\.' \(word 1 of the prompt\): a position is that of a symbol"),
     ],
 )
 def test_a_mistake_is_named_with_its_place(prompt, message):
     with pytest.raises(ValueError, match=message):
         encode_prompt(prompt, VOCABULARY, LENGTH)
+
+
+@pytest.mark.parametrize("symbol", ["_", "...", "put down", "7:A", ""])
+def test_what_no_prompt_could_name_is_no_symbol(symbol):
+    with pytest.raises(ValueError, match="cannot be a symbol"):
+        Vocabulary(["PAD", "A", symbol])
 
 
 def test_too_many_ways_to_place_a_prompt_are_refused():
@@ -92,8 +118,8 @@ def test_the_placement_that_the_planner_finds_likely_is_chosen():
     logits = torch.zeros(LENGTH, len(VOCABULARY))
     for position, word in enumerate(["DRAG", "BLUE", "STACK", "RED", "PAD", "PAD"]):
         logits[position, VOCABULARY.token_id(word)] = 12.0
-    assert (shared_tokens(ways) == FREE).all()
-    assert choose_placement(ways, logits).tolist() == [FREE, FREE, 5, 1, 0, 0]
+    assert (shared_tokens(ways) < 0).all()
+    assert choose_placement(ways, logits).tolist() == [FREE_SYMBOL, FREE_SYMBOL, 5, 1, 0, 0]
 
 
 def test_equally_likely_placements_are_drawn_equally_often():
@@ -120,7 +146,71 @@ class TestThroughThePolicy:
         with pytest.raises(ValueError, match="2 prompts for 4 observations"):
             policy.plan(inputs, ["PICK A", "PICK B"])
 
-    def test_the_configuration_gives_a_prompt_to_every_plan(self, make_planner, inputs, tmp_path):
+    def test_a_plan_may_end_where_the_planners_room_does(self, make_planner, inputs):
+        """Its plans have 18 symbols at most; an untrained planner finds all lengths equally likely."""
+        policy, *_ = make_planner()
+        plan = policy.eval().plan({key: value.repeat(60, 1) for key, value in inputs.items()}, "... PLACE A _ PAD")
+        words = [plan.symbols(i) for i in range(240)]
+        assert all(symbols[-3:-1] == ["PLACE", "A"] for symbols in words)
+        assert max(map(len, words)) == 18
+
+    def test_before_a_given_symbol_there_is_no_end(self, make_planner, inputs):
+        policy, *_ = make_planner()
+        plan = policy.eval().plan(inputs, "17:S1")
+        assert (plan.token_ids[:, :17] != PAD_ID).all()
+
+    def test_each_candidate_draws_its_own_places(self, make_planner, inputs):
+        policy, *_ = make_planner()
+        states = []
+        policy.eval().plan(inputs, "... AUX ...", num_candidates=8, on_step=lambda _, state: states.append(state))
+        given = states[0].tokens.unflatten(0, (4, 8)) != policy.vocabulary.mask_id
+        assert (given.sum(dim=2) == 1).all()
+        assert all(len(set(sample.long().argmax(dim=1).tolist())) > 1 for sample in given)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"token_ids": torch.full((4, 18), 8)}, r"token_ids must be in \[0, 7\], or -1"),
+            ({"token_ids": torch.full((4, 18), -3)}, r"token_ids must be in \[0, 7\], or -1"),
+            ({"token_ids": torch.zeros(4, 18)}, "token_ids must have .* the type torch.int64"),
+            ({"token_ids": torch.zeros(18, dtype=torch.int64)}, r"token_ids must have the shape \(4, 18\)"),
+            ({"actions": torch.zeros(4, 19, 3, dtype=torch.float64)}, "actions must have .* the type torch.float32"),
+            ({"actions": torch.full((4, 19, 3), torch.nan)}, "actions hold NaN or infinity"),
+            (
+                {"actions": torch.zeros(4, 19, 3), "actions_given": torch.ones(4, 18, dtype=torch.bool)},
+                r"actions_given must have the shape \(4, 19\)",
+            ),
+            (
+                {"actions": torch.zeros(4, 19, 3), "actions_given": torch.ones(4, 19)},
+                "actions_given must have .* the type torch.bool",
+            ),
+        ],
+    )
+    def test_a_prompt_of_tensors_is_checked(self, make_planner, inputs, given, message):
+        policy, *_ = make_planner()
+        with pytest.raises(ValueError, match=message):
+            policy.eval().plan(inputs, PlanPrompt(**given))
+
+    @pytest.mark.parametrize("sampler", ["ddpm", "confidence"])
+    def test_a_sample_of_which_all_is_given_stays_clean_whatever_the_others_have(self, make_planner, inputs, sampler):
+        policy, *_ = make_planner(sampler=sampler)
+        given = torch.zeros(4, 19, dtype=torch.bool)
+        given[0] = True
+        tokens = torch.full((4, 18), FREE)
+        tokens[0] = 3
+        actions, states = torch.rand(4, 19, 3), []
+        prompt = PlanPrompt(token_ids=tokens, actions=actions, actions_given=given)
+        assert not prompt.gives_part_of_motion
+        policy.eval().plan(inputs, prompt, on_step=lambda _, state: states.append(state))
+        assert all(torch.equal(state.motion[0], actions[0]) for state in states)
+        assert all((state.motion[1] != actions[1]).any() for state in states)
+
+    def test_a_checker_needs_something_to_choose_from(self, make_planner, inputs):
+        policy, *_ = make_planner()
+        with pytest.raises(ValueError, match="set num_candidates to more than 1"):
+            policy.eval().plan(inputs, check=lambda *_: [])
+
+    def test_the_configuration_gives_a_prompt_to_every_plan(self, make_planner, inputs):
         policy, *_ = make_planner(prompt="PICK B")
         plan = policy.eval().plan({**inputs, "observation.symbolic_plan": torch.zeros(4, 18, dtype=torch.int64)})
         assert [plan.symbols(i)[:2] for i in range(4)] == [["PICK", "B"]] * 4

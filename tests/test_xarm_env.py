@@ -7,6 +7,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
@@ -217,7 +218,10 @@ def test_lerobot_sees_the_features_that_the_config_announces(gym_id, obs_type):
     announced.pop("action")
     for name, feature in announced.items():
         assert tuple(batch[name].shape) == (1, *feature.shape), name
-    assert {name for name in batch if "symbolic_plan" not in name} == set(announced)
+    prompts = {"observation.symbolic_plan"} if "RedOnTop" in gym_id else set()
+    assert set(batch) == set(announced) | prompts
+    for name in prompts:
+        assert torch.equal(batch[name][0].long(), torch.tensor(vector_env.call("plan_prompt")[0]))
     assert vector_env.call("_max_episode_steps") == (config.planning_task.horizon,)
     assert len([name for name in announced if "images" in name]) == (0 if obs_type == "state" else len(CAMERAS))
     for _ in range(2):

@@ -62,6 +62,10 @@ class GaussianProcess:
 
     def corrupt(self, clean: Tensor, level: Tensor, generator: Generator | None = None) -> Corrupted:
         noise = torch.randn(clean.shape, device=clean.device, dtype=clean.dtype, generator=generator)
+        return self.add_noise(clean, noise, level)
+
+    def add_noise(self, clean: Tensor, noise: Tensor, level: Tensor) -> Corrupted:
+        """Eq. 1, with standard normal noise that is given."""
         signal, scale = self._signal_and_noise_scale(level, clean)
         match self.prediction_type:
             case "epsilon":

@@ -5,10 +5,12 @@ Example:
     hdp-plan --policy.path=outputs/train/run/checkpoints/last/pretrained_model --explain=7
 """
 
+import json
 import logging
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from textwrap import indent
 from typing import NamedTuple
@@ -18,23 +20,26 @@ import numpy as np
 import torch
 from draccus.utils import ParsingError
 from lerobot import envs, policies  # noqa: F401 (registers LeRobot's own)
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import PolicyFeature, PreTrainedConfig, parser
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors, preprocess_observation
-from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from torch import Tensor
 
-from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
+from gym_hdp_tasks.task import PlanningTask
+from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from lerobot_hdp.drawing import MASK_WORD, PlanPicture, draw_plan, save_animation
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.page import PageState, PlanPage, write_page
 from lerobot_hdp.plan import Plan, PlanPrompt
 from lerobot_hdp.sampling import DenoisingState
+from lerobot_hdp.vocabulary import Vocabulary
 
 WORDS_PER_ROW = 6
 MOST_STATES = 40
@@ -77,8 +82,10 @@ class PlanConfig:
         trained = TrainPipelineConfig.from_pretrained(path)
         self.env = self.env or trained.env
         self.dataset = self.dataset or trained.dataset
-        if self.env is None:
+        if self.explain is None and self.env is None:
             raise ValueError("the checkpoint names no task: choose one with --env.type=hdp --env.task=...")
+        if self.explain is not None and (self.prompt or self.html or self.check):
+            raise ValueError("--explain goes without --prompt, --html and --check: nothing is planned")
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
@@ -107,7 +114,7 @@ class Recorder:
     """The plan at every denoising step, in the units and pixels of one environment.
 
     Attributes:
-        states: step, motion and tokens, of all candidates.
+        states: of all candidates, after 0, 1, ... steps.
     """
 
     def __init__(self, env: gym.vector.VectorEnv, policy: HDPPolicy, unnormalise: Callable[[Tensor], np.ndarray]):
@@ -139,7 +146,7 @@ def make_plan(config: PlanConfig) -> Result:
     """Plan once, draw the motion over the scene and the denoising, then execute the plan in the environment.
 
     Raises:
-        ValueError: the policy is no planner of this package, or the prompt does not fit.
+        ValueError: the policy is no planner of this package or one for another task, or the prompt does not fit.
     """
     set_seed(config.seed)
     policy, preprocessor, postprocessor = _load(config)
@@ -147,13 +154,16 @@ def make_plan(config: PlanConfig) -> Result:
         raise ValueError("--check=true chooses among candidates: set --policy.num_candidates to more than 1")
     env_preprocessor, _ = make_env_pre_post_processors(config.env, config.policy)
     task = getattr(config.env, "planning_task", None)
+    if task is not None:
+        _check_task(policy.config, task)
+    elif config.check:
+        raise ValueError(f"--check=true: environments of type {config.env.type} come without a checker of plans")
     vector_envs = make_env(config.env, n_envs=1)
     try:
         env = next(iter(vector_envs[config.env.type].values()))
         observation, _ = env.reset(seed=config.seed)
         raw = {key: value[0] for key, value in observation.items() if isinstance(value, np.ndarray)}
         batch = preprocessor(env_preprocessor(preprocess_observation(observation)))
-        prompt = policy.read_prompt(batch, config.prompt or None)
 
         def unnormalise(motion: Tensor) -> np.ndarray:
             return postprocessor(motion).numpy()
@@ -162,11 +172,11 @@ def make_plan(config: PlanConfig) -> Result:
             return task.check_plan(symbols, raw)
 
         recorder = Recorder(env, policy, unnormalise)
-        plan = policy.plan(batch, prompt, on_step=recorder, check=check if task and config.check else None)
+        plan = policy.plan(batch, config.prompt or None, on_step=recorder, check=check if config.check else None)
         start, states = env.call("render")[0], recorder.page_states(plan)
         given = [False] * len(states[-1].words)
-        if prompt.tokens_mask is not None:
-            given = prompt.tokens_mask[0, : len(given)].tolist()
+        if plan.tokens_given is not None:
+            given = plan.tokens_given[0, : len(given)].tolist()
 
         config.output_dir.mkdir(parents=True, exist_ok=True)
         files = _draw(config, start, states, given)
@@ -176,8 +186,8 @@ def make_plan(config: PlanConfig) -> Result:
         if config.html is not None:
             probabilities = plan.token_probabilities[0, : len(given)].tolist()
             about = [_outcome(score, is_success), f"seed {config.seed}", *(complaints or [])]
-            if config.prompt:
-                about.insert(0, f"prompt: {config.prompt}")
+            if prompt := config.prompt or policy.config.prompt:
+                about.insert(0, f"prompt: {prompt}")
             write_page(PlanPage(about, start, frames, states, probabilities, given, step_ends), config.html)
             files["page"] = config.html
         return Result(plan.describe(0, step_ends), complaints, score, is_success, files)
@@ -189,7 +199,8 @@ def explain(config: PlanConfig) -> str:
     """What a recorded motion does, in the planner's words, and what the dataset says that it does.
 
     Raises:
-        ValueError: the planner has no symbols, or the dataset has no such episode or another horizon.
+        ValueError: the planner has no symbols, or the dataset has no such episode, other observations, or another
+            horizon.
     """
     set_seed(config.seed)
     policy, preprocessor, _ = _load(config)
@@ -198,7 +209,14 @@ def explain(config: PlanConfig) -> str:
     source = config.dataset
     if source is None:
         raise ValueError("the checkpoint names no dataset: choose one with --dataset.repo_id=... --dataset.root=...")
-    dataset = LeRobotDataset(source.repo_id, root=source.root, video_backend="pyav")
+    try:
+        dataset = LeRobotDataset(source.repo_id, root=source.root, video_backend="pyav")
+    except OSError as error:
+        raise ValueError(f"the dataset {source.repo_id} is not in {source.root}, nor to be had: {error}") from error
+    for key, feature in {**policy.config.input_features, **policy.config.output_features}.items():
+        shape = tuple(dataset.meta.features.get(key, {}).get("shape", ()))
+        if shape != feature.shape:
+            raise ValueError(f"the planner knows {key} of shape {feature.shape}, the dataset has {shape or 'none'}")
     if not 0 <= config.explain < dataset.num_episodes:
         raise ValueError(f"--explain={config.explain}: the dataset has the episodes 0 to {dataset.num_episodes - 1}")
     episode = dataset.meta.episodes[config.explain]
@@ -211,22 +229,47 @@ def explain(config: PlanConfig) -> str:
     batch = preprocessor({**observed, "action": actions[None]})
     plan = policy.plan(batch, PlanPrompt(actions=batch["action"]))
     task = getattr(config.env, "planning_task", None)
-    recorded = policy.vocabulary.decode(item[OBS_SYMBOLIC_PLAN])
-    agreement = "the recorded plan says the same" if recorded == plan.symbols() else f"recorded: {' '.join(recorded)}"
-    return (
-        f"episode {config.explain}:\n{indent(plan.describe(0, task.step_ends if task else None), '    ')}\n{agreement}"
+    words = plan.describe(0, task.step_ends if task else None)
+    return f"episode {config.explain}:\n{indent(words, '    ')}\n{_compare(plan.symbols(), dataset, item)}"
+
+
+def _compare(symbols: list[str], dataset: LeRobotDataset, item: dict[str, Tensor]) -> str:
+    """What the dataset says about a motion that was explained by symbols."""
+    if OBS_SYMBOLIC_PLAN not in item:
+        return "the dataset has no symbolic plans"
+    recorded = Vocabulary(dataset.meta.features[OBS_SYMBOLIC_PLAN]["info"]["vocabulary"]).decode(
+        item[OBS_SYMBOLIC_PLAN]
     )
+    return "the recorded plan says the same" if recorded == symbols else f"recorded: {' '.join(recorded)}"
 
 
 def _load(config: PlanConfig) -> tuple[HDPPolicy, PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """The planner, its preprocessor and its postprocessor."""
-    policy = make_policy(config.policy, env_cfg=config.env)
-    if not isinstance(policy, HDPPolicy):
-        raise ValueError(f"hdp-plan draws the plans of `hdp` policies, not of `{config.policy.type}`")
-    policy.eval()
-    device = {"device_processor": {"device": policy.config.device}}
     path = config.policy.pretrained_path
+    policy_class = get_policy_class(config.policy.type)
+    if not issubclass(policy_class, HDPPolicy):
+        raise ValueError(f"hdp-plan draws the plans of `hdp` policies, not of `{config.policy.type}`")
+    policy = policy_class.from_pretrained(path, config=config.policy).eval()
+    device = {"device_processor": {"device": policy.config.device}}
     return policy, *make_pre_post_processors(config.policy, path, preprocessor_overrides=device)
+
+
+def _check_task(planner: HDPConfig, task: PlanningTask) -> None:
+    """Refuse a task for which the planner was not made."""
+    features = planner.input_features
+    facts = {
+        "horizon": (planner.horizon, task.horizon),
+        "vocabulary": (planner.vocabulary and " ".join(planner.vocabulary), " ".join(task.vocabulary)),
+        "number of state components": (_size(features, OBS_STATE), len(task.state_names)),
+        "number of objects' components": (_size(features, OBS_ENV_STATE), len(task.environment_state_names)),
+    }
+    for fact, (planners, tasks) in facts.items():
+        if planners is not None and planners != tasks:
+            raise ValueError(f"the planner was trained for another task: its {fact} is {planners}, here it is {tasks}")
+
+
+def _size(features: dict[str, PolicyFeature], key: str) -> int | None:
+    return features[key].shape[0] if key in features else None
 
 
 def _draw(config: PlanConfig, scene: np.ndarray, states: list[PageState], given: list[bool]) -> dict[str, Path]:
@@ -294,12 +337,23 @@ def main() -> None:
     """Entry point of `hdp-plan`: bad input is one line on stderr and exit status 1."""
     logging.getLogger().setLevel(logging.WARNING)
     register_third_party_plugins()
+    sys.argv[1:] = _keep_prompt(sys.argv[1:])
     try:
         _main()
     except ParsingError as error:  # draccus wraps what happens while a checkpoint's configuration is read
         sys.exit(f"hdp-plan: {error.__cause__ or error}")
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"hdp-plan: {error}")
+
+
+def _keep_prompt(arguments: list[str]) -> list[str]:
+    """Quote the prompt: the parser reads values as YAML, to which `...` and `7: PICK` mean something."""
+    joined = [f"--prompt={value}" for name, value in pairwise(arguments) if name == "--prompt"]
+    kept = [argument for before, argument in pairwise(["", *arguments]) if "--prompt" not in (before, argument)]
+    return [
+        f"--prompt={json.dumps(argument.removeprefix('--prompt='))}" if argument.startswith("--prompt=") else argument
+        for argument in [*kept, *joined]
+    ]
 
 
 if __name__ == "__main__":
