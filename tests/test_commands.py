@@ -4,16 +4,19 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from html import unescape
 from pathlib import Path
 
 import pytest
 import torch
+from huggingface_hub import constants
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
 from lerobot_hdp import Vocabulary
+from lerobot_hdp.scripts import hdp_plan
 
 from .conftest import HORIZON, N_EPISODES, REPOSITORY, TASK_FLAGS, TINY_PLANNER, run_command
 
@@ -300,12 +303,15 @@ def test_hdp_plan_explains_a_dataset_without_symbols_and_without_a_task(checkpoi
         ([f"--explain={N_EPISODES}"], f"--explain={N_EPISODES}: the dataset has the episodes 0 to {N_EPISODES - 1}"),
     ],
 )
-def test_hdp_plan_answers_bad_input_with_one_line(checkpoint, tmp_path, flags, message):
+def test_hdp_plan_answers_bad_input_with_one_line(checkpoint, tmp_path, monkeypatch, flags, message):
     arguments = {"--policy.path": f"--policy.path={checkpoint}"} | {flag.split("=")[0]: flag for flag in flags}
-    result = run_command("hdp-plan", *arguments.values(), f"--output_dir={tmp_path / 'none'}", check=False)
-    assert result.returncode == 1
-    assert message in result.stderr.splitlines()[-1]
-    assert "Traceback" not in result.stderr
+    monkeypatch.setattr(sys, "argv", ["hdp-plan", *arguments.values(), f"--output_dir={tmp_path / 'none'}"])
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        hdp_plan.main()
+    assert message in end.value.code
+    assert "\n" not in end.value.code
     assert not (tmp_path / "none").exists()
 
 
