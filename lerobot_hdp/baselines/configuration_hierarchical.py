@@ -19,9 +19,10 @@ class HierarchicalDiffuserConfig(HDPConfig):
     of segments: the K actions from one sub-goal to the next. It is trained on the demonstration's own sub-goals, and
     plans between those of the high level, all segments in one batch.
 
-    Where this differs from their paper: sub-goals are not guided by a value function, as there is none; segments hold
+    Where this differs from their paper: neither level is guided by a value function, as there is none; segments hold
     actions only, like all planners here, not the states between sub-goals; what a level is conditioned on (the
-    observation; a segment's two sub-goals) is attended to, like HDP's observation, not in-painted.
+    observation; a segment's two sub-goals) is attended to, like HDP's observation, not in-painted. docs/planners.md has
+    the rest.
 
     Attributes:
         subgoal_interval: K. None: the square root of the horizon, so that both levels are about equally long.
@@ -64,9 +65,9 @@ class CoupledHierarchicalDiffuserConfig(HierarchicalDiffuserConfig):
     high level's current sub-goals, and the high level on the low level's current segments, so that sub-goals correct
     themselves while they are sampled.
 
-    Where this differs from their paper: there, the low level's feedback is the gradient of a classifier that is
-    trained on returns and shared by the levels. There are no returns here, so the feedback is learned: the high level's
-    denoiser attends to a token of each noisy segment. What else differs is what differs for `hd`.
+    After their abstract, in which the low level's feedback passes through a classifier that both levels share. There is
+    nothing to train one on here, so the feedback is learned: the high level's denoiser attends to a token of each noisy
+    segment. The choices are ours, see docs/planners.md.
     """
 
     coupled = True
