@@ -1,6 +1,7 @@
 """How the time of a training step and of a plan grows with the horizon and with the number of blocks.
 
-    python -m benchmarks.growth
+    python -m benchmarks.growth             # measures, then writes docs/growth.md
+    python -m benchmarks.growth --report    # only writes the page
 
 HDP, Diffuser (`diffuser`, the motion alone) and LeRobot's own diffusion policy (`diffusion`, a U-Net; needs
 `lerobot[diffusion]`), with random weights, one observation and the same number of network calls, measured in turns. The
@@ -15,7 +16,6 @@ import random
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -29,10 +29,11 @@ from torch import Tensor
 from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
 
-from .machine import describe_run
+from .machine import RESULTS, describe_run
+from .pages import DOCS, LABELS, markdown_table
 from .planner_latency import make_planner
 
-RESULTS = Path(__file__).parent / "results" / "growth.json"
+FILE, PAGE = RESULTS / "growth.json", DOCS / "growth.md"
 HORIZONS = (37, 73, 145, 289, 577)
 BLOCKS = (2, 3, 4, 6, 8)
 REFERENCE = "diffuser"
@@ -79,6 +80,7 @@ def make_batch(policy: PreTrainedPolicy, batch_size: int) -> dict[str, Tensor]:
 
 
 def train_step(policy: PreTrainedPolicy, batch: dict[str, Tensor]) -> None:
+    """Forward and backward pass, without the optimiser, which does not depend on the horizon."""
     policy.train()
     policy.forward(batch)[0].backward()
     policy.zero_grad()
@@ -134,6 +136,45 @@ def measure(env: HDPEnv, horizon: int, batch_size: int, rounds: int) -> dict[str
     }
 
 
+def write_page() -> None:
+    """The results file as two tables."""
+    file = json.loads(FILE.read_text())
+    run, result = file["run"], file["result"]
+    names = {name: LABELS.get(name, "LeRobot's diffusion policy") for name in ("diffuser", "hdp", "diffusion")}
+    header = ["training step" if column == "train_step" else "plan" for column in ("train_step", "plan") for _ in names]
+    header = [f"{what}, {name}" for what, name in zip(header, 2 * list(names.values()), strict=True)]
+
+    def cells(measured: dict[str, Any]) -> list[str]:
+        row = []
+        for column in ("train_step", "plan"):
+            for name in names:
+                milliseconds, ratios = measured[column][name]["ms"][1], measured[column][name]["ratio"]
+                spread = "" if name == REFERENCE else f", {ratios[1]:.2f} ({ratios[0]:.2f} to {ratios[2]:.2f})"
+                row.append(f"{milliseconds:.0f} ms{spread}")
+        return row
+
+    def table(label: str, key: str, rows: list[dict[str, Any]]) -> str:
+        content = [[str(row[key]), f"{row['horizon']} + {row['symbolic_horizon']}", *cells(row)] for row in rows]
+        return markdown_table([label, "actions + tokens", *header], content)
+
+    over_horizon, over_blocks = result["over_horizon"], result["over_blocks"]
+    parameters = over_horizon[0]["parameters"]
+    sizes = ", ".join(f"{names[name]} {parameters[name]:,}" for name in names)
+    PAGE.write_text(
+        "# How time grows with the horizon and with the number of blocks\n\n"
+        f"A training step is the forward and backward pass of a batch of {result['batch_size']}; a plan is made alone, "
+        f"with {result['num_inference_steps']} network calls. {result['num_layers']} layers of width "
+        f"{result['width']}; parameters at the first horizon: {sizes}. LeRobot's diffusion policy is a U-Net. Median "
+        "times, and the ratio to Diffuser's in the same turn (median and quartiles). "
+        f"{result['threads']} thread of {run['cores']} cores, {run['cpu']}. `{run['command']}`, code of "
+        f"{run['git_commit']}.\n\n"
+        "## Over the horizon\n\nThree blocks, more and more waypoints for the same plan.\n\n"
+        f"{table('actions', 'horizon', over_horizon)}\n"
+        "## Over the number of blocks\n\nOne waypoint a pose; horizon and symbols grow together.\n\n"
+        f"{table('blocks', 'n_blocks', over_blocks)}"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--horizons", type=int, nargs="*", default=HORIZONS)
@@ -141,7 +182,11 @@ def main() -> None:
     parser.add_argument("--batch_size", type=int, default=16, help="of a training step; a plan is made alone")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
+    if options.report:
+        write_page()
+        return
     torch.set_num_threads(options.threads)
     result: dict[str, Any] = {**NETWORK, "batch_size": options.batch_size, "threads": options.threads}
     result["over_horizon"], result["over_blocks"] = [], []
@@ -153,7 +198,8 @@ def main() -> None:
         measured = measure(env, env.planning_task.horizon, options.batch_size, options.rounds)
         result["over_blocks"].append({"n_blocks": n_blocks, **measured})
         print(json.dumps(result["over_blocks"][-1]), flush=True)
-    RESULTS.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+    FILE.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+    write_page()
 
 
 if __name__ == "__main__":
