@@ -6,6 +6,7 @@ import sys
 
 import pytest
 import torch
+import torch.nn.functional as F
 from draccus.utils import ParsingError
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -13,6 +14,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_eval, lerobot_train
 from safetensors.torch import load_file
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from lerobot_hdp import FREE, PlanPrompt
 from lerobot_hdp.prompt import encode_prompt
@@ -39,6 +41,32 @@ def training_batch(dataset):
         return torch.utils.data.default_collate([windowed[episode * HORIZON] for episode in range(4)])
 
     return load
+
+
+class HostReads(TorchDispatchMode):
+    """Finds where the host asks what is in a tensor: on a GPU, it would wait for the answer.
+
+    These are the operators whose result depends on data, and indexing by a mask. `tolist` and its like are no operators
+    where the tensor is on a CPU, so they are watched as methods. `one_hot` checks its ids on a CPU only, so that is
+    left out.
+    """
+
+    def __init__(self, monkeypatch):
+        super().__init__()
+        self.found: list[str] = []
+        for name in ("tolist", "numpy", "cpu"):
+            method = getattr(torch.Tensor, name)
+            monkeypatch.setattr(torch.Tensor, name, lambda *a, m=method, n=name: (self.found.append(n), m(*a))[1])
+        monkeypatch.setattr(F, "one_hot", lambda ids, size: torch.eye(size, dtype=torch.int64)[ids])
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func._schema.name.startswith("aten::index"):
+            waits = any(isinstance(index, torch.Tensor) and index.dtype == torch.bool for index in args[1])
+        else:
+            waits = {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(func.tags)
+        if waits:
+            self.found.append(str(func))
+        return func(*args, **kwargs or {})
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -106,6 +134,16 @@ class TestContract:
         resumed = get_policy_class(planner).from_pretrained(tmp_path).train()
         torch.rand(3)
         assert policy.forward(inputs)[0].item() == resumed.forward(inputs)[0].item()
+
+    def test_a_training_step_reads_the_device_once(self, make_planner, training_batch, planner, monkeypatch):
+        policy, preprocessor, _ = make_planner(planner)
+        inputs = preprocessor(training_batch(policy))
+        policy.train().forward(inputs)
+        policy.update()
+        with HostReads(monkeypatch) as reads:
+            policy.forward(inputs)[0].backward()
+            policy.update()
+        assert reads.found == ["tolist"]  # of the losses, for LeRobot's log
 
     def test_select_action_plays_the_plan(self, make_planner, batch, planner):
         policy, preprocessor, _ = make_planner(planner)

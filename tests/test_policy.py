@@ -6,8 +6,10 @@ from draccus.utils import ParsingError
 from lerobot.policies import make_policy
 
 from lerobot_hdp import FREE, HDPConfig, PlanPrompt
+from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
 from lerobot_hdp.denoiser import RotaryDecoderLayer
 from lerobot_hdp.modeling_hdp import HDPPolicy
+from lerobot_hdp.processor_hdp import SymbolicPlanProcessorStep
 from lerobot_hdp.prompt import encode_prompt
 
 from .conftest import HORIZON, TINY_PLANNER, train_in_process
@@ -233,6 +235,22 @@ def test_a_checkpoint_plans_the_same(make_planner, batch, tmp_path):
     assert first.symbols() == second.symbols()
 
 
+def test_a_policy_goes_on_from_the_state_that_it_loads(make_planner, batch):
+    """With the noise and the averaging of the next step, wherever it was itself."""
+    (ahead, preprocessor, _), (behind, *_) = make_planner(), make_planner()
+    inputs = preprocessor(batch)
+    for policy, steps in ((ahead, 3), (behind, 1)):
+        for _ in range(steps):
+            policy.train().forward(inputs)
+            policy.update()
+    behind.load_state_dict(ahead.state_dict())
+    assert behind.forward(inputs)[0].item() == ahead.forward(inputs)[0].item()
+    for policy in (ahead, behind):
+        torch.nn.init.ones_(next(policy.planner.parameters()))
+        policy.update()
+    assert all(torch.equal(value, ahead.state_dict()[name]) for name, value in behind.state_dict().items())
+
+
 def test_rotary_attention_is_plain_attention_that_knows_distances():
     plain = torch.nn.TransformerDecoderLayer(32, 4, 64, 0.0, batch_first=True, norm_first=True)
     tokens, memory = torch.randn(2, 5, 32), torch.randn(2, 3, 32)
@@ -319,6 +337,12 @@ class TestBadInput:
         batch["observation.symbolic_plan"][0, 0] = 8
         with pytest.raises(ValueError, match="token id 8, which is none of the 8 symbols"):
             preprocessor(batch)
+
+    def test_token_ids_on_a_device_are_not_read(self):
+        """The host would wait for them. A meta tensor has nothing to read."""
+        step = SymbolicPlanProcessorStep(symbolic_horizon=5, vocabulary_size=3)
+        plan = step.observation({OBS_SYMBOLIC_PLAN: torch.zeros(2, 4, dtype=torch.int64, device="meta")})
+        assert plan[OBS_SYMBOLIC_PLAN].shape == (2, 5)
 
     def test_a_horizon_that_is_not_the_episodes(self, make_planner):
         with pytest.raises(ValueError, match=r"episodes have 19 to 19 frames, the planner's horizon is 20"):
