@@ -17,6 +17,7 @@ from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
 from .encoders import StateEncoder
 from .moving_average import MovingAverage
+from .optimizer import parameter_groups
 from .plan import Plan, PlanCheck, PlanPrompt
 from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess, Process, SymbolProcess
 from .prompt import choose_placement, encode_prompt, shared_tokens
@@ -51,10 +52,6 @@ class Planner(nn.Module):
     @property
     def denoisers(self) -> list[Denoiser]:
         return [self.denoiser]
-
-    def parameter_groups(self) -> list[dict]:
-        """For an optimizer."""
-        return [{"params": list(self.encoder.parameters())}, *self.denoiser.parameter_groups()]
 
 
 class HDPPolicy(PreTrainedPolicy):
@@ -100,7 +97,7 @@ class HDPPolicy(PreTrainedPolicy):
         return Planner(self.config, self.symbol_process.num_states if self.symbol_process else 0)
 
     def get_optim_params(self) -> list[dict]:
-        return self.planner.parameter_groups()
+        return parameter_groups(self.planner)
 
     def reset(self) -> None:
         """Forget the plan in execution. To be called on `env.reset()`."""

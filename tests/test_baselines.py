@@ -112,6 +112,14 @@ class TestContract:
         optimised = [id(p) for group in policy.get_optim_params() for p in group["params"]]
         assert sorted(optimised) == sorted(map(id, trainable))
 
+    def test_only_matrices_of_linear_layers_decay(self, make_planner, planner):
+        policy, *_ = make_planner(planner)
+        decay, no_decay = policy.get_optim_params()
+        linear = [m.weight for m in policy.planner.modules() if isinstance(m, torch.nn.Linear)]
+        attention = [m.in_proj_weight for m in policy.planner.modules() if isinstance(m, torch.nn.MultiheadAttention)]
+        assert set(map(id, decay["params"])) == set(map(id, linear + attention))
+        assert no_decay["weight_decay"] == 0
+
     def test_a_checkpoint_plans_the_same(self, make_planner, batch, planner, tmp_path):
         policy, preprocessor, postprocessor = make_planner(planner)
         for part in (policy, preprocessor, postprocessor):

@@ -86,12 +86,6 @@ class HierarchicalPlanner(nn.Module):
     def denoisers(self) -> list[Denoiser]:
         return [self.high, self.low]
 
-    def parameter_groups(self) -> list[dict]:
-        """For an optimizer."""
-        encoders = [self.encode_observation, self.encode_ends, self.encode_segments]
-        parameters = [parameter for encoder in encoders if encoder is not None for parameter in encoder.parameters()]
-        return [{"params": parameters}, *self.high.parameter_groups(), *self.low.parameter_groups()]
-
 
 class HierarchicalDiffuserPolicy(HDPPolicy):
     """Plans sub-goals, then the segments between them."""
