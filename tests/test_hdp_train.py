@@ -2,10 +2,13 @@
 
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.configs.default import DatasetConfig
@@ -17,7 +20,7 @@ from safetensors.torch import load_file
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_hdp import HDPConfig
-from lerobot_hdp.in_memory_dataset import InMemoryDataset, memory_needed
+from lerobot_hdp.in_memory_dataset import InMemoryDataset, memory_needed, unsupported
 from lerobot_hdp.scripts import hdp_train
 
 from .conftest import TINY_PLANNER, run_command
@@ -123,6 +126,28 @@ def test_image_transforms_are_drawn_as_by_lerobot(camera_root):
             "test/cameras", root=camera_root, image_transforms=transforms, return_uint8=True, video_backend="pyav"
         )
     )
+
+
+@pytest.mark.parametrize("camera_root", ["video"], indirect=True)
+def test_frames_are_those_at_the_stored_timestamps(camera_root, tmp_path):
+    """Here, each frame is shown twice."""
+    root = tmp_path / "repeated"
+    shutil.copytree(camera_root, root)
+    [path] = root.glob("data/**/*.parquet")
+    table = pq.read_table(path)
+    repeated = pa.array(table["frame_index"].to_numpy() // 2 / FPS, pa.float32())
+    column = table.schema.get_field_index("timestamp")
+    pq.write_table(table.set_column(column, table.schema.field(column), repeated), path)
+    assert_same_samples(LeRobotDataset("test/repeated", root=root, return_uint8=True, video_backend="pyav"))
+
+
+@pytest.mark.parametrize("camera_root", ["image"], indirect=True)
+def test_a_column_of_another_kind_is_named(camera_root, monkeypatch):
+    dataset = LeRobotDataset("test/cameras", root=camera_root)
+    assert unsupported(dataset) is None
+    monkeypatch.setitem(dataset.meta.features["remark"], "dtype", "binary")
+    with pytest.raises(ValueError, match="cannot be held in memory: remark holds values of type binary"):
+        InMemoryDataset(dataset)
 
 
 def test_memory_needed_counts_every_tensor(camera_root):
