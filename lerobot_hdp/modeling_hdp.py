@@ -419,11 +419,14 @@ def _rank_and_world_size() -> tuple[int, int]:
 
 
 def _check_episodes_fit(config: HDPConfig, lengths: Iterable[int]) -> None:
-    """Whole plans need episodes of exactly the horizon's length."""
+    """Whole plans need episodes of exactly the horizon's length.
+
+    LeRobot gives a policy the metadata of all episodes, and does not say which of them it trains on.
+    """
     lengths = set(lengths)
     if config.plan_from == "episode_start" and lengths != {config.horizon}:
         raise ValueError(
             f"the dataset's episodes have {min(lengths)} to {max(lengths)} frames, the planner's horizon is "
             f"{config.horizon}. Set --policy.horizon to the episodes' length; if they differ among each other, "
-            "train with --policy.plan_from=any_frame."
+            "train with --policy.plan_from=any_frame. Episodes that --dataset.episodes leaves out count, too."
         )
