@@ -6,11 +6,11 @@ from typing import Any, ClassVar
 
 from draccus.utils import ParsingError
 from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
 
 from .encoders import object_sizes
+from .optimizer import FusedAdamWConfig
 from .processes.masked import MASK_SCHEDULES
 from .prompt import encode_prompt
 from .vocabulary import Vocabulary
@@ -98,6 +98,7 @@ class HDPConfig(PreTrainedConfig):
         dtype: `float32`, or `bfloat16` for autocast in training and planning.
 
         optimizer_*, scheduler_*: AdamW with a linear warm-up and a cosine decay to the last step.
+            `optimizer_fused`: update all parameters in one kernel; None: on CUDA.
 
     Raises:
         ParsingError: a value that cannot be. It is draccus' own error, because LeRobot's commands hide the message of
@@ -147,6 +148,7 @@ class HDPConfig(PreTrainedConfig):
     optimizer_eps: float = 1e-8
     optimizer_weight_decay: float = 1e-3
     optimizer_grad_clip_norm: float = 10.0
+    optimizer_fused: bool | None = None
     scheduler_warmup_steps: int | None = None
 
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -275,13 +277,14 @@ class HDPConfig(PreTrainedConfig):
             raise ValueError("--policy.horizon is missing: the number of frames of the dataset's episodes")
         return self.horizon
 
-    def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
+    def get_optimizer_preset(self) -> FusedAdamWConfig:
+        return FusedAdamWConfig(
             lr=self.optimizer_lr,
             betas=self.optimizer_betas,
             eps=self.optimizer_eps,
             weight_decay=self.optimizer_weight_decay,
             grad_clip_norm=self.optimizer_grad_clip_norm,
+            fused=self.optimizer_fused,
         )
 
     def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:

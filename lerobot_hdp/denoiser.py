@@ -171,15 +171,6 @@ class Denoiser(nn.Module):
         symbol_prediction = self.symbol_head(hidden[:, self.horizon :]) if self.models_symbols else None
         return Prediction(motion_prediction, symbol_prediction)
 
-    def parameter_groups(self) -> list[dict]:
-        """Parameters with weight decay (matrices of linear layers) and without (the rest), for an optimizer."""
-        decay: list[nn.Parameter] = []
-        no_decay: list[nn.Parameter] = []
-        for name, parameter in self.named_parameters():
-            is_matrix = parameter.ndim == 2 and "positions" not in name
-            (decay if is_matrix else no_decay).append(parameter)
-        return [{"params": decay}, {"params": no_decay, "weight_decay": 0.0}]
-
 
 def _attention_kernels(device: torch.device) -> AbstractContextManager:
     """PyTorch's choice, but for bfloat16 training on a CPU, where its fused kernel has a slow backward pass."""

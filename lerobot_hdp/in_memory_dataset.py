@@ -5,6 +5,7 @@ one gather in each column. PyTorch's data loader asks for it through `__getitems
 """
 
 import math
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from lerobot.datasets.video_utils import decode_video_frames
 from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 from tqdm import tqdm
+
+SUPPORTED_DTYPES = ("float", "int", "uint", "bool", "string", "image", "video")
+"""How the names of the types begin that a column in memory can have."""
 
 
 class Batch(dict):
@@ -39,7 +43,7 @@ class InMemoryDataset(LeRobotDataset):
         dataset: what to load; `unsupported(dataset)` must be None.
 
     Raises:
-        ValueError: the dataset has columns that are no tensors.
+        ValueError: it cannot be held in memory.
     """
 
     def __init__(self, dataset: LeRobotDataset):
@@ -50,7 +54,10 @@ class InMemoryDataset(LeRobotDataset):
         episodes, inverse, lengths = self._columns["episode_index"].unique_consecutive(
             return_inverse=True, return_counts=True
         )
-        self._columns |= {key: _decode_videos(dataset, key, episodes.tolist()) for key in self.meta.video_keys}
+        timestamps = self._columns["timestamp"].split(lengths.tolist())
+        seconds = {episode: times.tolist() for episode, times in zip(episodes.tolist(), timestamps, strict=True)}
+        for key in self.meta.video_keys:
+            self._columns[key] = _join(dataset.num_frames, _decode_videos(dataset, key, seconds))
         ends = lengths.cumsum(0)
         self._first, self._last = (ends - lengths)[inverse], (ends - 1)[inverse]
         self._offsets = {key: torch.tensor(deltas) for key, deltas in (self.reader.delta_indices or {}).items()}
@@ -92,6 +99,9 @@ def unsupported(dataset: LeRobotDataset) -> str | None:
         return "it is streamed"
     if dataset.meta.depth_keys:
         return f"{dataset.meta.depth_keys[0]} holds depth maps"
+    for key, feature in dataset.meta.features.items():
+        if key not in LANGUAGE_COLUMNS and not feature["dtype"].startswith(SUPPORTED_DTYPES):
+            return f"{key} holds values of type {feature['dtype']}"
     return None
 
 
@@ -113,8 +123,8 @@ def _read_columns(dataset: LeRobotDataset) -> tuple[dict[str, Tensor], dict[str,
         if key in LANGUAGE_COLUMNS:
             continue  # LeRobot leaves them out of a batch, too
         if key in dataset.meta.image_keys:
-            images = (torch.from_numpy(np.array(row[key])) for row in table.select_columns(key))
-            columns[key] = torch.stack([image.reshape(*image.shape[:2], -1).permute(2, 0, 1) for image in images])
+            images = (np.atleast_3d(np.array(row[key])) for row in table.select_columns(key))
+            columns[key] = _join(len(table), (torch.from_numpy(image).permute(2, 0, 1)[None] for image in images))
         elif dataset.meta.features[key]["dtype"] == "string":
             words[key] = table[key][:]
         else:
@@ -124,18 +134,27 @@ def _read_columns(dataset: LeRobotDataset) -> tuple[dict[str, Tensor], dict[str,
     return columns, words
 
 
-def _decode_videos(dataset: LeRobotDataset, key: str, episodes: list[int]) -> Tensor:
-    """All frames of a camera, episode by episode: (N, C, H, W) uint8."""
-    height, width, channels = dataset.meta.features[key]["shape"]
-    frames = torch.empty(dataset.num_frames, channels, height, width, dtype=torch.uint8)
-    stop = 0
-    for index in tqdm(episodes, desc=f"Decoding {key}", unit="episode"):
-        episode = dataset.meta.episodes[index]
-        first = episode[f"videos/{key}/from_timestamp"]
-        timestamps = [first + i / dataset.fps for i in range(episode["length"])]
+def _decode_videos(dataset: LeRobotDataset, key: str, seconds: dict[int, list[float]]) -> Iterator[Tensor]:
+    """The frames of a camera in each episode: (n, C, H, W) uint8.
+
+    Args:
+        dataset: where the videos are.
+        key: of the camera.
+        seconds: for each episode, the timestamps of its frames, from its beginning.
+    """
+    for index, timestamps in tqdm(seconds.items(), desc=f"Decoding {key}", unit="episode"):
+        first = dataset.meta.episodes[index][f"videos/{key}/from_timestamp"]
         path = dataset.root / dataset.meta.get_video_file_path(index, key)
-        start, stop = stop, stop + len(timestamps)
-        frames[start:stop] = decode_video_frames(
-            path, timestamps, dataset.tolerance_s, dataset._video_backend, return_uint8=True
-        )
-    return frames
+        moments = [first + timestamp for timestamp in timestamps]
+        yield decode_video_frames(path, moments, dataset.tolerance_s, dataset._video_backend, return_uint8=True)
+
+
+def _join(length: int, parts: Iterable[Tensor]) -> Tensor:
+    """Parts (n, ...) one after another: (length, ...). Unlike `torch.cat`, it never holds all of them twice."""
+    joined, stop = torch.empty(0), 0
+    for part in parts:
+        if stop == 0:
+            joined = torch.empty(length, *part.shape[1:], dtype=part.dtype)
+        start, stop = stop, stop + len(part)
+        joined[start:stop] = part
+    return joined

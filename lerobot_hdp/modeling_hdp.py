@@ -11,12 +11,13 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from safetensors import SafetensorError
 from torch import Generator, Tensor, nn
-from torch.optim.swa_utils import AveragedModel
 
 from .candidates import PARTIAL_MOTION_CANDIDATES, best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
 from .encoders import StateEncoder
+from .moving_average import MovingAverage
+from .optimizer import parameter_groups
 from .plan import Plan, PlanCheck, PlanPrompt
 from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess, Process, SymbolProcess
 from .prompt import choose_placement, encode_prompt, shared_tokens
@@ -52,10 +53,6 @@ class Planner(nn.Module):
     def denoisers(self) -> list[Denoiser]:
         return [self.denoiser]
 
-    def parameter_groups(self) -> list[dict]:
-        """For an optimizer."""
-        return [{"params": list(self.encoder.parameters())}, *self.denoiser.parameter_groups()]
-
 
 class HDPPolicy(PreTrainedPolicy):
     """Hybrid Diffusion Planner (Høeg et al. 2026): denoises a motion and the symbolic plan behind it at once.
@@ -84,7 +81,8 @@ class HDPPolicy(PreTrainedPolicy):
         self.motion_process, self.symbol_process = make_processes(config)
 
         self.planner = self._make_planner()
-        self.ema = _moving_average(self.planner, config) if config.ema_max_decay > 0 else None
+        averages = config.ema_max_decay > 0
+        self.ema = MovingAverage(self.planner, config.ema_power, config.ema_max_decay) if averages else None
         if config.compile_model:
             for network in {self.planner, self._planning_network}:
                 for denoiser in network.denoisers:
@@ -92,13 +90,14 @@ class HDPPolicy(PreTrainedPolicy):
         # Training noise is a function of these two, so that a resumed run goes on exactly as if never interrupted.
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
         self.register_buffer("forward_calls", torch.tensor(0))
+        self._seed_and_calls: tuple[int, int] | None = None
         self.reset()
 
     def _make_planner(self) -> Planner:
         return Planner(self.config, self.symbol_process.num_states if self.symbol_process else 0)
 
     def get_optim_params(self) -> list[dict]:
-        return self.planner.parameter_groups()
+        return parameter_groups(self.planner)
 
     def reset(self) -> None:
         """Forget the plan in execution. To be called on `env.reset()`."""
@@ -107,7 +106,7 @@ class HDPPolicy(PreTrainedPolicy):
     def update(self) -> None:
         """Move the averaged weights. LeRobot calls this after each optimiser step."""
         if self.ema is not None:
-            self.ema.update_parameters(self.planner)
+            self.ema.update(self.planner)
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Algorithm 1: corrupt motion and symbols independently, denoise both, L = L_DDPM + lambda L_MD4.
@@ -120,12 +119,26 @@ class HDPPolicy(PreTrainedPolicy):
         """
         if not self.training:
             return self._loss(batch, self._planning_network, None)
-        self.forward_calls += 1
-        step = [int(self.noise_seed), int(self.forward_calls)]
+        step = self._next_step()
         generator = Generator(self._device).manual_seed(_seed(*step))
         with torch.random.fork_rng(devices=self._cuda_devices):
             torch.manual_seed(_seed(*step, 1 + _rank_and_world_size()[0]))  # of dropout
             return self._loss(batch, self.planner, generator)
+
+    def _next_step(self) -> tuple[int, int]:
+        """Count a training step: `noise_seed` and `forward_calls`.
+
+        The two are kept as numbers, too, because reading them makes the host wait for the device. They are read at the
+        first step, when a distributed run has sent its first process' buffers to the others.
+        """
+        seed, calls = self._seed_and_calls or (int(self.noise_seed), int(self.forward_calls))
+        self._seed_and_calls = seed, calls + 1
+        self.forward_calls += 1
+        return self._seed_and_calls
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._seed_and_calls = None
 
     def _loss(
         self, batch: dict[str, Tensor], network: Planner, generator: Generator | None
@@ -137,7 +150,7 @@ class HDPPolicy(PreTrainedPolicy):
         if self.symbol_process is None:
             prediction = network.denoiser(noisy_motion.value, None, observation, k_c, torch.zeros_like(k_c))
             loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
-            return loss, {"motion_loss": loss.item()}
+            return loss, numbers(motion_loss=loss)
 
         if not self.config.shared_level:
             levels = self._sample_levels(self.symbol_process, len(motion), generator)
@@ -148,7 +161,7 @@ class HDPPolicy(PreTrainedPolicy):
         motion_loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
         symbol_loss = self.symbol_process.loss(prediction.symbols, corrupted_symbols).mean()
         loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
-        return loss, {"motion_loss": motion_loss.item(), "symbol_loss": symbol_loss.item()}
+        return loss, numbers(motion_loss=motion_loss, symbol_loss=symbol_loss)
 
     def _sample_levels(self, process: Process, batch_size: int, generator: Generator | None) -> Tensor:
         """Levels for the batches of all processes of a distributed run, (processes x B,); see `_corrupt`."""
@@ -404,16 +417,10 @@ def make_processes(config: HDPConfig) -> tuple[GaussianProcess, SymbolProcess | 
             return motion, None
 
 
-def _moving_average(network: nn.Module, config: HDPConfig) -> AveragedModel:
-    """Exponential moving average with Diffusion Policy's warm-up of the decay."""
-
-    @torch.no_grad()
-    def update(averaged: list[Tensor], current: list[Tensor], num_averaged: Tensor) -> None:
-        decay = min(1 - (1 + int(num_averaged)) ** -config.ema_power, config.ema_max_decay)
-        torch._foreach_lerp_(averaged, current, 1 - decay)
-
-    average = AveragedModel(network, multi_avg_fn=update)
-    return average.requires_grad_(False).eval()
+@torch.no_grad()
+def numbers(**losses: Tensor) -> dict[str, float]:
+    """Losses () as numbers, for logging. They are read at once: each reading makes the host wait for the device."""
+    return dict(zip(losses, torch.stack(list(losses.values())).tolist(), strict=True))
 
 
 def _seed(*numbers: int) -> int:
@@ -436,11 +443,14 @@ def _rank_and_world_size() -> tuple[int, int]:
 
 
 def _check_episodes_fit(config: HDPConfig, lengths: Iterable[int]) -> None:
-    """Whole plans need episodes of exactly the horizon's length."""
+    """Whole plans need episodes of exactly the horizon's length.
+
+    LeRobot gives a policy the metadata of all episodes, and does not say which of them it trains on.
+    """
     lengths = set(lengths)
     if config.plan_from == "episode_start" and lengths != {config.horizon}:
         raise ValueError(
             f"the dataset's episodes have {min(lengths)} to {max(lengths)} frames, the planner's horizon is "
             f"{config.horizon}. Set --policy.horizon to the episodes' length; if they differ among each other, "
-            "train with --policy.plan_from=any_frame."
+            "train with --policy.plan_from=any_frame. Episodes that --dataset.episodes leaves out count, too."
         )

@@ -2,23 +2,32 @@
 
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
+from lerobot.scripts import lerobot_train
 from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from safetensors.torch import load_file
 from torch.utils.data import DataLoader, Subset
 
-from lerobot_hdp.in_memory_dataset import InMemoryDataset, memory_needed
+from lerobot_hdp import HDPConfig
+from lerobot_hdp.in_memory_dataset import InMemoryDataset, memory_needed, unsupported
+from lerobot_hdp.scripts import hdp_train
 
 from .conftest import TINY_PLANNER, run_command
 
 FPS = 10
 STEPS = 6
+TWO_PROCESSES = ("torchrun", "--nproc_per_node=2", Path(sys.executable).with_name("hdp-train"))
 PLANNER_FLAGS = ("--policy.type=hdp", *(f"--policy.{name}={value}" for name, value in TINY_PLANNER.items()))
 DIFFUSION_FLAGS = ("--policy.type=diffusion", "--policy.down_dims=[16,32]", "--policy.crop_shape=[24,24]")
 DIFFUSION_FLAGS += ("--policy.pretrained_backbone_weights=null", "--policy.use_group_norm=true")
@@ -119,10 +128,72 @@ def test_image_transforms_are_drawn_as_by_lerobot(camera_root):
     )
 
 
+@pytest.mark.parametrize("camera_root", ["video"], indirect=True)
+def test_frames_are_those_at_the_stored_timestamps(camera_root, tmp_path):
+    """Here, each frame is shown twice."""
+    root = tmp_path / "repeated"
+    shutil.copytree(camera_root, root)
+    [path] = root.glob("data/**/*.parquet")
+    table = pq.read_table(path)
+    repeated = pa.array(table["frame_index"].to_numpy() // 2 / FPS, pa.float32())
+    column = table.schema.get_field_index("timestamp")
+    pq.write_table(table.set_column(column, table.schema.field(column), repeated), path)
+    assert_same_samples(LeRobotDataset("test/repeated", root=root, return_uint8=True, video_backend="pyav"))
+
+
+@pytest.mark.parametrize("camera_root", ["image"], indirect=True)
+def test_a_column_of_another_kind_is_named(camera_root, monkeypatch):
+    dataset = LeRobotDataset("test/cameras", root=camera_root)
+    assert unsupported(dataset) is None
+    monkeypatch.setitem(dataset.meta.features["remark"], "dtype", "binary")
+    with pytest.raises(ValueError, match="cannot be held in memory: remark holds values of type binary"):
+        InMemoryDataset(dataset)
+
+
 def test_memory_needed_counts_every_tensor(camera_root):
     dataset = LeRobotDataset("test/cameras", root=camera_root, video_backend="pyav", return_uint8=True)
     columns = InMemoryDataset(dataset)._columns.values()
     assert memory_needed(dataset) == pytest.approx(sum(c.numel() * c.element_size() for c in columns), rel=0.01)
+
+
+@pytest.fixture
+def open_datasets(monkeypatch):
+    """Open datasets as hdp-train does: `open_datasets(root, max_gib, **dataset_config) -> datasets, num_workers`."""
+    for name in ("make_train_eval_datasets", "lerobot_collate_fn", "save_checkpoint"):
+        monkeypatch.setattr(lerobot_train, name, getattr(lerobot_train, name))
+
+    def open_(root, max_gib=1.0, **kwargs):
+        dataset = DatasetConfig("test/dataset", root=str(root), video_backend="pyav", **kwargs)
+        config = TrainPipelineConfig(dataset, policy=HDPConfig(horizon=3, device="cpu"), num_workers=3)
+        hdp_train.hold_datasets_in_memory(max_gib)
+        return lerobot_train.make_train_eval_datasets(config), config.num_workers
+
+    return open_
+
+
+@pytest.mark.parametrize("camera_root", ["video"], indirect=True)
+@pytest.mark.parametrize(("enable", "expected"), [(True, 3), (False, 0)])
+def test_workers_are_kept_for_image_transforms_alone(camera_root, open_datasets, enable, expected):
+    datasets, num_workers = open_datasets(camera_root, image_transforms=ImageTransformsConfig(enable=enable))
+    assert isinstance(datasets[0], InMemoryDataset)
+    assert num_workers == expected
+
+
+@pytest.mark.parametrize(("share", "held"), [(1.1, True), (0.75, False)])
+def test_the_held_out_dataset_counts_in_the_budget(dataset_root, open_datasets, share, held):
+    whole = LeRobotDataset("test/dataset", root=dataset_root)
+    datasets, _ = open_datasets(dataset_root, share * memory_needed(whole) / hdp_train.GIB, eval_split=0.5)
+    assert len(datasets[0]) == len(datasets[1]) == len(whole) / 2
+    assert [isinstance(dataset, InMemoryDataset) for dataset in datasets] == [held, held]
+
+
+@pytest.mark.parametrize("flag", ["--max_train_minutes", "--max_memory_gib"])
+@pytest.mark.parametrize("value", ["-1", "nan"])
+def test_a_limit_below_zero_is_refused(monkeypatch, capsys, flag, value):
+    monkeypatch.setattr(sys, "argv", ["hdp-train", f"{flag}={value}"])
+    with pytest.raises(SystemExit, match="2"):
+        hdp_train.main()
+    assert f"argument {flag}: must be at least 0, got {value}" in capsys.readouterr().err
 
 
 def train(command, root, output_dir, policy_flags, *flags):
@@ -183,6 +254,13 @@ def test_a_run_that_is_out_of_time_leaves_a_checkpoint_and_goes_on_from_it(datas
     assert_same_weights(weights(run), weights(lerobot_train_run[1]))
 
 
+def test_a_job_elsewhere_is_refused():
+    flags = ("--dataset.repo_id=test/dataset", *PLANNER_FLAGS, "--job.target=l4x1")
+    result = run_command("hdp-train", *flags, check=False)
+    assert result.returncode
+    assert "with --job.target=l4x1, use lerobot-train" in result.stderr
+
+
 def test_a_dataset_beyond_the_budget_is_read_as_by_lerobot_train(dataset_root, lerobot_train_run, tmp_path):
     result = train("hdp-train", dataset_root, tmp_path / "run", PLANNER_FLAGS, "--max_memory_gib=0.0001")
     assert "more than --max_memory_gib=0.0001" in result.stderr
@@ -191,13 +269,19 @@ def test_a_dataset_beyond_the_budget_is_read_as_by_lerobot_train(dataset_root, l
 
 def test_two_processes_do_what_one_does_with_twice_the_batch(dataset_root, lerobot_train_run, tmp_path):
     expected, expected_dir = lerobot_train_run
-    command = ("torchrun", "--nproc_per_node=2", Path(sys.executable).with_name("hdp-train"))
-    result = train(command, dataset_root, tmp_path / "run", PLANNER_FLAGS, "--batch_size=5")
+    result = train(TWO_PROCESSES, dataset_root, tmp_path / "run", PLANNER_FLAGS, "--batch_size=5")
     assert "Effective batch size: 5 x 2 = 10" in result.stderr
     assert losses(result) == losses(expected)
     one, two = weights(expected_dir), weights(tmp_path / "run")
     for name, value in one.items():
         torch.testing.assert_close(two[name], value, rtol=1e-4, atol=1e-6)
+
+
+def test_two_processes_that_are_out_of_time_leave_a_checkpoint(dataset_root, tmp_path):
+    train(TWO_PROCESSES, dataset_root, tmp_path / "run", PLANNER_FLAGS, "--max_train_minutes=0")
+    checkpoints = tmp_path / "run/checkpoints"
+    assert [path.name for path in checkpoints.iterdir() if not path.is_symlink()] == ["000001"]
+    assert weights(tmp_path / "run")["forward_calls"] == 1
 
 
 @pytest.mark.parametrize("camera_root", ["video"], indirect=True)

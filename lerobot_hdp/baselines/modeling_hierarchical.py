@@ -13,7 +13,7 @@ from torch import Generator, Tensor, nn
 
 from ..denoiser import Denoiser, Prediction
 from ..encoders import StateEncoder
-from ..modeling_hdp import HDPPolicy
+from ..modeling_hdp import HDPPolicy, numbers
 from ..plan import Plan, PlanPrompt
 from ..sampling import DenoisingState, Stream, sample_plan
 from .configuration_hierarchical import CoupledHierarchicalDiffuserConfig, HierarchicalDiffuserConfig
@@ -86,12 +86,6 @@ class HierarchicalPlanner(nn.Module):
     def denoisers(self) -> list[Denoiser]:
         return [self.high, self.low]
 
-    def parameter_groups(self) -> list[dict]:
-        """For an optimizer."""
-        encoders = [self.encode_observation, self.encode_ends, self.encode_segments]
-        parameters = [parameter for encoder in encoders if encoder is not None for parameter in encoder.parameters()]
-        return [{"params": parameters}, *self.high.parameter_groups(), *self.low.parameter_groups()]
-
 
 class HierarchicalDiffuserPolicy(HDPPolicy):
     """Plans sub-goals, then the segments between them."""
@@ -144,7 +138,7 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
         )
         prediction = network.denoise_segments(noisy_segments.value, state, subgoals, noisy_segments.level)
         motion_loss = process.loss(prediction, noisy_segments).mean()
-        return subgoal_loss + motion_loss, {"subgoal_loss": subgoal_loss.item(), "motion_loss": motion_loss.item()}
+        return subgoal_loss + motion_loss, numbers(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
 
     def _sample(
         self,
@@ -205,7 +199,7 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
         high, low = self._denoise_both(network, noisy_subgoals.value, noisy_segments.value, state, noisy_subgoals.level)
         subgoal_loss = process.loss(high, noisy_subgoals).mean()
         motion_loss = process.loss(low, noisy_segments).mean()
-        return subgoal_loss + motion_loss, {"subgoal_loss": subgoal_loss.item(), "motion_loss": motion_loss.item()}
+        return subgoal_loss + motion_loss, numbers(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
 
     def _denoise_both(
         self, network: HierarchicalPlanner, subgoals: Tensor, segments: Tensor, state: Tensor, level: Tensor

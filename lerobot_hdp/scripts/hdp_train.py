@@ -2,9 +2,9 @@
 
 Takes all flags of `lerobot-train`, and does what it does with them, from checkpoints to `--resume` and `accelerate
 launch`: it runs LeRobot's training function. What it changes are some names in LeRobot's module, below, where LeRobot
-0.6.1 has no hook: the functions that open the datasets, collate a batch with language columns and write a checkpoint,
-and, for `--max_train_minutes`, those that decide about a checkpoint and do a step. A `dataset_factory` and a
-`should_stop` argument of `lerobot.scripts.lerobot_train.train` would make this unnecessary.
+0.6.1 has no hook: the functions that open the datasets, collate a batch with language columns, write a checkpoint and
+submit a job, and, for `--max_train_minutes`, those that decide about a checkpoint and do a step. A `dataset_factory`
+and a `should_stop` argument of `lerobot.scripts.lerobot_train.train` would make this unnecessary.
 
 Example:
     hdp-train --config_path=configs/xarm_sorting.json --max_train_minutes=30
@@ -20,6 +20,7 @@ import torch
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_train
+from lerobot.utils.collate import lerobot_collate_fn
 
 from lerobot_hdp.in_memory_dataset import Batch, InMemoryDataset, memory_needed, unsupported
 
@@ -32,25 +33,20 @@ class OutOfTimeError(Exception):
 
 def hold_datasets_in_memory(max_gib: float) -> None:
     """Let `lerobot-train` hold its datasets in memory, if they need at most `max_gib` GiB; else it reads as always."""
-    make_datasets, collate = lerobot_train.make_train_eval_datasets, lerobot_train.lerobot_collate_fn
-    save_checkpoint, users_num_workers = lerobot_train.save_checkpoint, None
+    make_datasets, save_checkpoint = lerobot_train.make_train_eval_datasets, lerobot_train.save_checkpoint
+    users_num_workers = None
 
     def make_datasets_in_memory(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
         nonlocal users_num_workers
         users_num_workers = cfg.num_workers
-        datasets = make_datasets(cfg)
-        for dataset in filter(None, datasets):
-            reason = unsupported(dataset)
-            if reason is None and memory_needed(dataset) > max_gib * GIB:
-                reason = f"it needs {memory_needed(dataset) / GIB:.1f} GiB, more than --max_memory_gib={max_gib:g}"
-            if reason is not None:
-                logging.warning("The dataset is read item by item, as by lerobot-train: %s", reason)
-                return datasets
-        cfg.num_workers = 0  # there is nothing to wait for
-        return tuple(None if dataset is None else InMemoryDataset(dataset) for dataset in datasets)
-
-    def collate_unless_collated(samples: list[Any]) -> Any:
-        return samples[0] if isinstance(samples[0], Batch) else collate(samples)
+        train_and_eval = make_datasets(cfg)
+        datasets = [dataset for dataset in train_and_eval if dataset is not None]
+        if (reason := _why_not_in_memory(datasets, max_gib)) is not None:
+            logging.warning("The dataset is read item by item, as by lerobot-train: %s", reason)
+            return train_and_eval
+        if all(dataset.image_transforms is None for dataset in datasets):
+            cfg.num_workers = 0  # there is nothing to wait for; image transforms are made sample by sample
+        return tuple(None if dataset is None else InMemoryDataset(dataset) for dataset in train_and_eval)
 
     def save_with_users_num_workers(*args: Any, cfg: TrainPipelineConfig, **kwargs: Any) -> None:
         cfg.num_workers = users_num_workers  # for whoever resumes with lerobot-train
@@ -59,6 +55,29 @@ def hold_datasets_in_memory(max_gib: float) -> None:
     lerobot_train.make_train_eval_datasets = make_datasets_in_memory
     lerobot_train.save_checkpoint = save_with_users_num_workers
     lerobot_train.lerobot_collate_fn = collate_unless_collated
+
+
+def _why_not_in_memory(datasets: list[LeRobotDataset], max_gib: float) -> str | None:
+    """What keeps datasets from being held in memory together, in words; None: nothing."""
+    for dataset in datasets:
+        if (reason := unsupported(dataset)) is not None:
+            return reason
+    needed = sum(map(memory_needed, datasets)) / GIB
+    return f"it needs {needed:.1f} GiB, more than --max_memory_gib={max_gib:g}" if needed > max_gib else None
+
+
+def collate_unless_collated(samples: list[Any]) -> Any:
+    """LeRobot's collation of a batch with language columns, which one from memory does not need."""
+    return samples[0] if isinstance(samples[0], Batch) else lerobot_collate_fn(samples)
+
+
+def refuse_to_submit(cfg: TrainPipelineConfig) -> None:
+    """In place of LeRobot's submission of a job, which would lose what `hdp-train` adds.
+
+    Raises:
+        ValueError: always.
+    """
+    raise ValueError(f"hdp-train trains on this machine: with --job.target={cfg.job.target}, use lerobot-train")
 
 
 def stop_after(minutes: float) -> None:
@@ -102,17 +121,28 @@ def _on_any_process(flag: bool) -> bool:
     return bool(flags)
 
 
+def non_negative(text: str) -> float:
+    """A number of at least 0, for argparse."""
+    if not (number := float(text)) >= 0:
+        raise argparse.ArgumentTypeError(f"must be at least 0, got {text}")
+    return number
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         "hdp-train", description="lerobot-train with the dataset in memory.", add_help=False, allow_abbrev=False
     )
-    parser.add_argument("--max_train_minutes", type=float, help="write a checkpoint and stop after this time")
+    parser.add_argument("--max_train_minutes", type=non_negative, help="write a checkpoint and stop after this time")
     parser.add_argument(
-        "--max_memory_gib", type=float, default=8.0, help="largest dataset to hold in each process's memory, in GiB"
+        "--max_memory_gib",
+        type=non_negative,
+        default=8.0,
+        help="largest dataset, with its held-out part, to hold in each process's memory, in GiB",
     )
     options, sys.argv[1:] = parser.parse_known_args()
     if "--help" in sys.argv or "-h" in sys.argv:
         parser.print_help()
+    lerobot_train.submit_to_hf = refuse_to_submit
     hold_datasets_in_memory(options.max_memory_gib)
     if options.max_train_minutes is not None:
         stop_after(options.max_train_minutes)
