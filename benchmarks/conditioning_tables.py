@@ -85,7 +85,7 @@ def table(file: str, title: str, header: Sequence[str]) -> str:
     return f"**{title}** ([json](../benchmarks/results/{path.name}))\n\n{lines}\n`{run['command']}`, on {where}.\n"
 
 
-def main() -> None:
+def write_page() -> None:
     before = PAGE.read_text().split(HEADING)[0]
     note = (
         "95 % intervals are Wilson's; the same starts in every column of a table, one training of each planner. The "
@@ -96,4 +96,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    write_page()

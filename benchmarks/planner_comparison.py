@@ -16,7 +16,7 @@ from .cells import FIRST_EVALUATION_SEED, Cell, run_cells
 from .evaluation import evaluate
 from .machine import describe_run
 from .paper.presets import METHODS, make_cells
-from .planner_report import SAMPLERS_FILE, write_report
+from .planner_report import SAMPLERS_FILE, write_page
 
 PRESETS = ("mini", "mini_epsilon")
 TASKS = ("block_sorting_2d_2_blocks", "block_sorting_2d_3_blocks")
@@ -52,7 +52,7 @@ def main() -> None:
         compare_samplers(make_cells([PRESETS[0]], [TASKS[1]], METHODS, options.seeds))
     elif not options.report:
         run_cells(cells, options.processes)
-    write_report(cells)
+    write_page(cells)
 
 
 if __name__ == "__main__":

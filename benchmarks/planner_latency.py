@@ -32,7 +32,7 @@ from .pages import DOCS, markdown_table
 from .paper.presets import ENVS, METHODS, PRESETS, make_cell
 
 RESULTS = Path(__file__).parent / "results" / "planner_latency.json"
-TABLE = DOCS / "planner_latency.md"
+PAGE = DOCS / "planner_latency.md"
 REFERENCE = "diffuser"
 
 
@@ -80,7 +80,7 @@ def measure(planners: dict[str, HDPPolicy], batch_size: int, rounds: int) -> dic
     }
 
 
-def write_table() -> None:
+def write_page() -> None:
     """Write the page from the results file."""
     content = json.loads(RESULTS.read_text())
     run, result = content["run"], content["result"]
@@ -103,7 +103,7 @@ def write_table() -> None:
             for low, middle, high in (measured[name]["ms"], measured[name]["ratio"]):
                 cells.append(f"{middle:g} ({low:g} to {high:g})")
         rows.append(cells)
-    TABLE.write_text("\n".join([*lines, markdown_table(header, rows)]))
+    PAGE.write_text("\n".join([*lines, markdown_table(header, rows)]))
 
 
 def main() -> None:
@@ -137,8 +137,8 @@ def main() -> None:
         "batch_size": {size: measure(planners, size, options.rounds) for size in options.batch_sizes},
     }
     RESULTS.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
-    write_table()
-    print(TABLE.read_text())
+    write_page()
+    print(PAGE.read_text())
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from .machine import RESULTS
 from .pages import DOCS, LABELS, markdown_table, plot_curves
 from .paper.presets import METHODS
 
-TABLE, PLOT = DOCS / "planner_comparison.md", DOCS / "images" / "planner_comparison.svg"
+PAGE, PLOT = DOCS / "planner_comparison.md", DOCS / "images" / "planner_comparison.svg"
 SAMPLERS_FILE = RESULTS / "planner_samplers.json"
 PREDICTED = {"mini": "the clean motion is predicted", "mini_epsilon": "the noise is predicted"}
 NOTES = {
@@ -91,7 +91,7 @@ def samplers_section() -> list[str]:
     ]
 
 
-def write_report(cells: Sequence[Cell]) -> None:
+def write_page(cells: Sequence[Cell]) -> None:
     """Write the page and the plot of the cells that are finished."""
     panels: dict[Panel, dict[str, list[dict[str, Any]]]] = defaultdict(lambda: defaultdict(list))
     settings, commits = {}, set()
@@ -128,10 +128,10 @@ def write_report(cells: Sequence[Cell]) -> None:
             "",
             markdown_table(header, rows(planners)).rstrip(),
         ]
-    TABLE.write_text("\n".join([*lines, *samplers_section()]) + "\n")
+    PAGE.write_text("\n".join([*lines, *samplers_section()]) + "\n")
     curves = {
         panel.title: {planner: [result["curve"] for result in seeds] for planner, seeds in planners.items()}
         for panel, planners in panels.items()
     }
     plot_curves(curves, PLOT)
-    print(f"{TABLE}\n{PLOT}")
+    print(f"{PAGE}\n{PLOT}")

@@ -32,10 +32,11 @@ from torch.utils.data import DataLoader
 import lerobot_policy_hdp  # noqa: F401 (registers the planners)
 from lerobot_hdp.in_memory_dataset import InMemoryDataset
 
-from .machine import describe_run
+from .machine import RESULTS, describe_run
+from .pages import DOCS
 
-RESULTS = Path(__file__).parent / "results" / "training_speed.json"
-PAGE = Path(__file__).parents[1] / "docs" / "training_speed.md"
+FILE = RESULTS / "training_speed.json"
+PAGE = DOCS / "training_speed.md"
 ON_A_GPU = """\
 ## On a GPU
 
@@ -159,7 +160,7 @@ def end_to_end(flags: list[str], steps: int, rounds: int) -> dict[str, Any]:
 
 def write_page() -> None:
     """The result in words."""
-    file = json.loads(RESULTS.read_text())
+    file = json.loads(FILE.read_text())
     run, result = file["run"], file["result"]
     data, step, commands = result["data_path"], result["step"], result["end_to_end"]
     rates = {name: statistics.median(found) for name, found in commands["samples_per_s"].items()}
@@ -222,7 +223,7 @@ def main() -> None:
     result["data_path"] = data_path(dataset, options.batch_size, options.horizon, options.rounds)
     result["step"] = step_overhead(dataset, config, options.batch_size, options.rounds)
     result["end_to_end"] = end_to_end(flags, options.steps, options.command_rounds)
-    RESULTS.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+    FILE.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
     write_page()
     print(PAGE.read_text())
 

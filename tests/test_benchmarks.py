@@ -1,13 +1,17 @@
-"""The benchmarks can be started, and say how."""
+"""The benchmarks can be started, say how, and have written the pages that are committed."""
 
 import importlib
 import pkgutil
+import shutil
 
 import pytest
 
 import benchmarks
+from benchmarks.paper.presets import METHODS, make_cells
+from benchmarks.planner_comparison import PRESETS, TASKS
 
 MODULES = sorted(module.name for module in pkgutil.iter_modules(benchmarks.__path__))
+PAGES = ("ablations", "conditioning_tables", "few_step_planning", "growth", "planner_latency", "training_speed")
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -15,3 +19,23 @@ def test_a_benchmark_can_be_imported_and_states_its_command(name):
     module = importlib.import_module(f"benchmarks.{name}")
     if hasattr(module, "main"):
         assert f"python -m benchmarks.{name}" in module.__doc__
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_is_what_the_committed_results_make(name, tmp_path, monkeypatch):
+    module = importlib.import_module(f"benchmarks.{name}")
+    committed, written = module.PAGE, tmp_path / module.PAGE.name
+    shutil.copy(committed, written)  # of some, only a part is written
+    monkeypatch.setattr(module, "PAGE", written)
+    module.write_page()
+    assert written.read_text() == committed.read_text()
+
+
+def test_the_comparison_of_planners_is_what_the_committed_results_make(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    module = importlib.import_module("benchmarks.planner_report")
+    committed = module.PAGE
+    monkeypatch.setattr(module, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(module, "plot_curves", lambda *_: None)
+    module.write_page(make_cells(PRESETS, TASKS, METHODS, [0, 1]))
+    assert module.PAGE.read_text() == committed.read_text()
