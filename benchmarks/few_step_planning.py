@@ -74,7 +74,7 @@ def write_page() -> None:
         samplers = [sampler for sampler in SAMPLERS if any(key[0] == sampler for key in cells)]
         page += f"## `{result['planner']}`, {result['task']}\n\n"
         page += f"{result['episodes']} starts, one checkpoint of {result['train_steps']} steps; "
-        page += f"`{file['run']['command']}`.\n\n"
+        page += f"`{file['run']['command']}`, code of {file['run']['git_commit']}.\n\n"
         rows = [
             [str(calls), *(_percent(cells.get((sampler, calls))) for sampler in samplers)]
             for calls in sorted({key[1] for key in cells})
