@@ -18,13 +18,14 @@ from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_p
 import lerobot_policy_hdp  # noqa: F401 (registers the policies and the tasks)
 from gym_hdp_tasks.block_sorting_2d import block_name
 from gym_hdp_tasks.open_loop import execute_plans
+from gym_hdp_tasks.xarm_env import XArmEnv
 from lerobot_hdp import PlanPrompt
 
 BATCH = 50
 """Plans that are made at once."""
 MISTAKES = ("missed", "lost", "misplaced")
-"""How a motion fails: the gripper closes on nothing; what it holds slips out; or neither, and something was taken, or
-set down, that should not have been, there."""
+"""How a motion fails: the gripper closes on nothing; what it holds slips out; or it takes or sets down something in a
+wrong place."""
 GRIPS_BELOW, EMPTY_BELOW = 0.1, 0.15
 """A gripper that is told to close to less than the first, and closes to less than the second, holds nothing."""
 Outcome = dict[str, Any]
@@ -157,9 +158,9 @@ def execute(subject: Subject, motions: np.ndarray, seeds: Sequence[int]) -> list
     return outcomes
 
 
-def first_mistake(subject: Subject, motion: np.ndarray, seed: int) -> str:
+def first_mistake(env: gym.Env, motion: np.ndarray, seed: int) -> str:
     """What goes wrong first in a motion that fails, one of `MISTAKES`."""
-    env = subject.make_env().unwrapped
+    env = env.unwrapped
     env.reset(seed=seed)
     held = False
     for action in motion:
@@ -167,7 +168,7 @@ def first_mistake(subject: Subject, motion: np.ndarray, seed: int) -> str:
         if action[-1] >= GRIPS_BELOW:
             held = False
             continue
-        empty = env.gripper_opening() < EMPTY_BELOW if "XArm" in subject.gym_id else env.held is None
+        empty = env.gripper_opening() < EMPTY_BELOW if isinstance(env, XArmEnv) else env.held is None
         if empty:
             return "lost" if held else "missed"
         held = True
@@ -199,11 +200,12 @@ def evaluate(path: Path, starts: int, first_seed: int, **options: Any) -> dict[s
         "mean_score": round(np.mean([outcome["score"] for outcome in outcomes]), 4),
     }
     if subject.policy.symbol_process is not None:
-        check = subject.make_env().unwrapped.planning_task.check_plan
+        env = subject.make_env()
+        check = env.unwrapped.planning_task.check_plan
         valid = [not check(*pair) for pair in zip(plans.symbols, subject.observations, strict=True)]
         failed = [index for index, outcome in enumerate(outcomes) if not outcome["is_success"]]
         of_motion = [index for index in failed if valid[index]]
-        mistakes = Counter(first_mistake(subject, plans.motions[index], subject.seeds[index]) for index in of_motion)
+        mistakes = Counter(first_mistake(env, plans.motions[index], subject.seeds[index]) for index in of_motion)
         result |= {"valid_plans": sum(valid), "failures": len(failed), "failures_with_valid_plan": len(of_motion)}
         result["first_mistakes"] = {mistake: mistakes[mistake] for mistake in MISTAKES}
     return result

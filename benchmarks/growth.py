@@ -141,8 +141,7 @@ def write_page() -> None:
     file = json.loads(FILE.read_text())
     run, result = file["run"], file["result"]
     names = {name: LABELS.get(name, "LeRobot's diffusion policy") for name in ("diffuser", "hdp", "diffusion")}
-    header = ["training step" if column == "train_step" else "plan" for column in ("train_step", "plan") for _ in names]
-    header = [f"{what}, {name}" for what, name in zip(header, 2 * list(names.values()), strict=True)]
+    header = [f"{what}, {name}" for what in ("training step", "plan") for name in names.values()]
 
     def cells(measured: dict[str, Any]) -> list[str]:
         row = []

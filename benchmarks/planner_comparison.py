@@ -12,6 +12,8 @@ import argparse
 import json
 from typing import Any
 
+from lerobot_hdp.configuration_hdp import SAMPLERS
+
 from .cells import FIRST_EVALUATION_SEED, Cell, run_cells
 from .evaluation import evaluate
 from .machine import describe_run
@@ -20,9 +22,6 @@ from .planner_report import SAMPLERS_FILE, write_page
 
 PRESETS = ("mini", "mini_epsilon")
 TASKS = ("block_sorting_2d_2_blocks", "block_sorting_2d_3_blocks")
-SAMPLERS = {"hdp": ("confidence", "ddim", "ddpm")}
-"""Of the samplers, two differ for a planner without masked symbols."""
-OTHERS_SAMPLERS = ("ddim", "ddpm")
 
 
 def compare_samplers(cells: list[Cell]) -> None:
@@ -30,7 +29,9 @@ def compare_samplers(cells: list[Cell]) -> None:
     run, results = describe_run(), []
     for cell in cells:
         planner = cell.policy["type"]
-        for sampler in SAMPLERS.get(planner, OTHERS_SAMPLERS):
+        for sampler in SAMPLERS:
+            if sampler == "confidence" and planner != "hdp":
+                continue  # that is ddim for planners without masked symbols
             checkpoint = cell.folder / "train" / "checkpoints" / "last" / "pretrained_model"
             first_seed = FIRST_EVALUATION_SEED + (cell.evaluations - 1) * cell.starts
             result: dict[str, Any] = {"planner": planner, "seed": cell.seed, "sampler": sampler}

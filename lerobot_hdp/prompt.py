@@ -30,6 +30,8 @@ FILLER_WORDS = ("FROM", "TO")
 """Ignored, unless they are symbols."""
 MAX_PLACEMENTS = 10_000
 """More ways to place a prompt than this are refused; each further part without a place multiplies them."""
+MAX_TRIED = 10 * MAX_PLACEMENTS
+"""The same way may come up more than once."""
 
 
 @dataclass
@@ -71,7 +73,7 @@ def encode_prompt(prompt: str, vocabulary: Vocabulary, length: int) -> Tensor:
     for part in parts:
         if part.start is not None and not -length <= part.start < length + part.ends:
             raise ValueError(f"{part.said} is outside of a plan of {length} symbols")
-    ways = list(islice(_placements(parts, length), 10 * MAX_PLACEMENTS + 1))
+    ways = list(islice(_placements(parts, length), MAX_TRIED + 1))
     rows = list(dict.fromkeys(ways))
     if not rows:
         fits = (any(_placements(parts[: number + 1], length)) for number in range(len(parts)))
@@ -80,7 +82,7 @@ def encode_prompt(prompt: str, vocabulary: Vocabulary, length: int) -> Tensor:
             f"the prompt '{prompt}' does not fit into a plan of {length} symbols: there is no room for what begins "
             f"with {said}, after what comes before it"
         )
-    if len(ways) > 10 * MAX_PLACEMENTS or len(rows) > MAX_PLACEMENTS:
+    if len(ways) > MAX_TRIED or len(rows) > MAX_PLACEMENTS:
         raise ValueError(
             f"the prompt '{prompt}' can be placed in too many ways: give positions by number, as in 7:PICK"
         )

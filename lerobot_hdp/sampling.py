@@ -123,6 +123,7 @@ def sample_plan(
     tokens: Tensor | None = None
     probabilities = torch.zeros(batch_size, 0, device=device)
     k_d = torch.zeros(batch_size, device=device)
+    not_pad = prompt.not_pad if isinstance(symbol_process, MaskedProcess) else None
     if symbol_process is not None:
         symbols = start(symbol_process, (batch_size, symbolic_horizon), prompt.token_ids, prompt.tokens_mask)
         tokens = symbol_process.tokens(symbols.value)
@@ -140,8 +141,8 @@ def sample_plan(
             assert symbol_process is not None
             assert prediction.symbols is not None
             before, scores = symbols.value, prediction.symbols
-            if prompt.not_pad is not None and isinstance(symbol_process, MaskedProcess):
-                scores[..., PAD_ID] = scores[..., PAD_ID].masked_fill(prompt.not_pad, -torch.inf)
+            if not_pad is not None:
+                scores[..., PAD_ID] = scores[..., PAD_ID].masked_fill(not_pad, -torch.inf)
             symbols.advance(i, scores, generator)
             tokens = symbol_process.tokens(symbols.value)
             if isinstance(symbol_process, MaskedProcess):

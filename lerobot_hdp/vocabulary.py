@@ -14,9 +14,6 @@ FREE_SYMBOL = -2
 """The same, where the plan has not ended: any symbol but PAD."""
 
 
-NAME = r"[^\s:…]+"
-
-
 class Vocabulary:
     """Symbols in words <-> token ids.
 
@@ -36,7 +33,7 @@ class Vocabulary:
         if len(symbols) < 2 or len({symbol.upper() for symbol in symbols}) != len(symbols):
             raise ValueError(f"a vocabulary is PAD and at least one more symbol, each once; got {list(symbols)}")
         for symbol in symbols:
-            if not re.fullmatch(NAME, symbol) or symbol == "_" or "..." in symbol:
+            if not re.fullmatch(r"[^\s:…]+", symbol) or symbol == "_" or "..." in symbol:
                 raise ValueError(
                     f"{symbol!r} cannot be a symbol: prompts name one by a word without spaces, ':' or '...'"
                 )

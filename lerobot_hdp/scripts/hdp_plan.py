@@ -10,10 +10,9 @@ import logging
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from textwrap import indent
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -32,7 +31,6 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from torch import Tensor
 
-from gym_hdp_tasks.task import PlanningTask
 from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from lerobot_hdp.drawing import MASK_WORD, PlanPicture, draw_plan, save_animation
 from lerobot_hdp.modeling_hdp import HDPPolicy
@@ -237,9 +235,8 @@ def _compare(symbols: list[str], dataset: LeRobotDataset, item: dict[str, Tensor
     """What the dataset says about a motion that was explained by symbols."""
     if OBS_SYMBOLIC_PLAN not in item:
         return "the dataset has no symbolic plans"
-    recorded = Vocabulary(dataset.meta.features[OBS_SYMBOLIC_PLAN]["info"]["vocabulary"]).decode(
-        item[OBS_SYMBOLIC_PLAN]
-    )
+    vocabulary = Vocabulary(dataset.meta.features[OBS_SYMBOLIC_PLAN]["info"]["vocabulary"])
+    recorded = vocabulary.decode(item[OBS_SYMBOLIC_PLAN])
     return "the recorded plan says the same" if recorded == symbols else f"recorded: {' '.join(recorded)}"
 
 
@@ -254,8 +251,8 @@ def _load(config: PlanConfig) -> tuple[HDPPolicy, PolicyProcessorPipeline, Polic
     return policy, *make_pre_post_processors(config.policy, path, preprocessor_overrides=device)
 
 
-def _check_task(planner: HDPConfig, task: PlanningTask) -> None:
-    """Refuse a task for which the planner was not made."""
+def _check_task(planner: HDPConfig, task: Any) -> None:
+    """Refuse a task (`planning_task` of an environment's configuration) for which the planner was not made."""
     features = planner.input_features
     facts = {
         "horizon": (planner.horizon, task.horizon),
@@ -348,12 +345,13 @@ def main() -> None:
 
 def _keep_prompt(arguments: list[str]) -> list[str]:
     """Quote the prompt: the parser reads values as YAML, to which `...` and `7: PICK` mean something."""
-    joined = [f"--prompt={value}" for name, value in pairwise(arguments) if name == "--prompt"]
-    kept = [argument for before, argument in pairwise(["", *arguments]) if "--prompt" not in (before, argument)]
-    return [
-        f"--prompt={json.dumps(argument.removeprefix('--prompt='))}" if argument.startswith("--prompt=") else argument
-        for argument in [*kept, *joined]
-    ]
+    kept, rest = [], iter(arguments)
+    for argument in rest:
+        name, equals, value = argument.partition("=")
+        if name == "--prompt":
+            argument = f"--prompt={json.dumps(value if equals else next(rest, ''))}"
+        kept.append(argument)
+    return kept
 
 
 if __name__ == "__main__":
