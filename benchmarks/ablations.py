@@ -41,6 +41,8 @@ CHANGES: dict[str, dict[str, Any]] = {
     "observation_weight_std=0.02": {"observation_weight_std": 0.02},
     "optimizer_lr=5e-4": {"optimizer_lr": 5e-4},
     "optimizer_lr=2e-3": {"optimizer_lr": 2e-3},
+    "optimizer_lr=2e-3, symbol_loss_weight=1/1000": {"optimizer_lr": 2e-3, "symbol_loss_weight": 1 / 1000},
+    "optimizer_lr=4e-3": {"optimizer_lr": 4e-3},
     # Joint's loss as one mean over one continuous variable: with three blocks, 36 symbols of 10 components beside 37
     # actions of 3 weigh 36 * 10 / (37 * 3).
     "type=joint_diffuser, symbol_loss_weight=3.2": {"type": "joint_diffuser", "symbol_loss_weight": 3.2},

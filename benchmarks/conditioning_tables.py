@@ -55,6 +55,7 @@ ADHERENCE = (
     "without it",
     "network calls",
 )
+CANDIDATES = ("task", "k", "by likelihood", "by the task's checker, then likelihood", "time for a plan")
 TABLES = (
     ("adherence_XArmToolUseRedOnTop", "P(red on top, given that all are stacked); the prompt: red last", ADHERENCE),
     ("adherence_BlockSorting2D", "P(the named block is moved first, given success); the prompt: that block", ADHERENCE),
@@ -63,11 +64,8 @@ TABLES = (
         "Success",
         ("task", "a valid plan given", "nothing given", "starts", "network calls"),
     ),
-    (
-        "candidates_BlockSorting2D",
-        "Success of the best of k plans",
-        ("task", "k", "by likelihood", "by the task's checker, then likelihood", "time for a plan"),
-    ),
+    ("candidates_BlockSorting2D", "Success of the best of k plans", CANDIDATES),
+    ("candidates_XArmArrangeBlocks", "Success of the best of k plans", CANDIDATES),
 )
 ROWS = {"adherence": adherence_rows, "valid": valid_plan_rows, "candidates": candidates_rows}
 

@@ -47,3 +47,20 @@ def test_lerobot_finds_the_plugin_from_any_folder(installed, tmp_path):
 def test_train_configs_are_installed(installed):
     shipped = {path.name for path in (installed / "share/lerobot_policy_hdp/configs").glob("*.json")}
     assert shipped == {path.name for path in (REPOSITORY / "configs").glob("*.json")}
+
+
+@pytest.mark.parametrize(
+    ("package", "stays_out_of"),
+    [("lerobot_hdp", ["gym_hdp_tasks", "dataset_tools"]), ("gym_hdp_tasks", ["lerobot_hdp", "dataset_tools"])],
+)
+def test_a_package_works_without_those_that_build_on_it(installed, package, stays_out_of):
+    """Its modules are imported where the others cannot be."""
+    modules = [
+        ".".join(path.relative_to(installed).with_suffix("").parts).removesuffix(".__init__")
+        for path in sorted((installed / package).rglob("*.py"))
+    ]
+    blocked = "".join(f"sys.modules[{name!r}] = None; " for name in stays_out_of)
+    code = f"import sys, importlib; {blocked}[importlib.import_module(name) for name in {modules}]"
+    environment = {**os.environ, "PYTHONPATH": str(installed)}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
