@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from huggingface_hub import ModelCard
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from safetensors import SafetensorError
@@ -16,6 +17,7 @@ from .candidates import PARTIAL_MOTION_CANDIDATES, best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
 from .encoders import StateEncoder
+from .model_card import describe_planner
 from .moving_average import MovingAverage
 from .optimizer import parameter_groups
 from .plan import Plan, PlanCheck, PlanPrompt
@@ -221,9 +223,10 @@ class HDPPolicy(PreTrainedPolicy):
         inputs = [key for key in (*self.config.input_features, OBS_SYMBOLIC_PLAN) if key in batch]
         repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in inputs}
         if isinstance(prompt, PlanPrompt):
+            self._check_prompt(prompt, self._batch_size(batch))
             prompt = prompt.repeat(k)
-        elif prompt is not None and not isinstance(prompt, str):
-            prompt = [text for text in prompt for _ in range(k)]
+        elif prompt is not None:
+            prompt = [text for text in _one_text_each(prompt, self._batch_size(batch)) for _ in range(k)]
         plans = self._sample(repeated, self.read_prompt(repeated, prompt, generator), generator, on_step)
         scores = self.score(repeated, plans).unflatten(0, (-1, k))
         complaints = None
@@ -279,7 +282,7 @@ class HDPPolicy(PreTrainedPolicy):
         if prompt is None:
             return PlanPrompt()
         if not isinstance(prompt, PlanPrompt):
-            texts = [prompt] * self._batch_size(batch) if isinstance(prompt, str) else list(prompt)
+            texts = _one_text_each(prompt, self._batch_size(batch))
             prompt = PlanPrompt(token_ids=self._place_words(batch, texts, generator))
         prompt = prompt.to(self._device)
         self._check_prompt(prompt, self._batch_size(batch))
@@ -289,8 +292,6 @@ class HDPPolicy(PreTrainedPolicy):
         """Token ids of a prompt in words for each sample: (B, H_d)."""
         if self.symbol_process is None:
             raise ValueError("this planner models no symbols: it takes no symbolic prompt")
-        if len(texts) != self._batch_size(batch):
-            raise ValueError(f"there are {len(texts)} prompts for {self._batch_size(batch)} observations")
         length = self.config.symbolic_horizon
         encoded = {text: encode_prompt(text, self.vocabulary, length).to(self._device) for text in set(texts)}
         placements = [encoded[text] for text in texts]
@@ -392,6 +393,10 @@ class HDPPolicy(PreTrainedPolicy):
         if prompt.actions_given is not None:
             _check_tensor("actions_given", prompt.actions_given, shape[:2], torch.bool)
 
+    def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
+        """The README.md that goes to the Hub with the weights: LeRobot's, and what this planner is."""
+        return describe_planner(super().generate_model_card(*args, **kwargs), self.config)
+
     @classmethod
     def _load_as_safetensor(cls, model: "HDPPolicy", model_file: str, map_location: str, strict: bool) -> "HDPPolicy":
         """Load the whole checkpoint or none of it: half-loaded weights plan nonsense without a word."""
@@ -426,6 +431,14 @@ def numbers(**losses: Tensor) -> dict[str, float]:
 def _seed(*numbers: int) -> int:
     """A seed that follows from some numbers."""
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+
+
+def _one_text_each(prompt: str | Sequence[str], batch_size: int) -> list[str]:
+    """A prompt in words for each observation."""
+    texts = [prompt] * batch_size if isinstance(prompt, str) else list(prompt)
+    if len(texts) != batch_size:
+        raise ValueError(f"there are {len(texts)} prompts for {batch_size} observations")
+    return texts
 
 
 def _check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:

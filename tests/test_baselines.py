@@ -8,6 +8,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from draccus.utils import ParsingError
+from huggingface_hub import ModelCard
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -74,6 +75,21 @@ class HostReads(TorchDispatchMode):
 @pytest.mark.parametrize("planner", PLANNERS)
 class TestContract:
     """`hdp` keeps it too; what is particular to it is tested in test_policy.py."""
+
+    def test_its_card_on_the_hub_says_what_it_is(self, planner, make_planner, dataset, inputs, monkeypatch):
+        monkeypatch.setattr(ModelCard, "validate", lambda card: None)  # asks the Hub
+        policy, *_ = make_planner(planner, repo_id="me/sorter")
+        card = policy.generate_model_card("local/sorting", planner, None, ["xarm"], dataset_meta=dataset.meta)
+        assert {"lerobot", "robotics", planner, "xarm"} == set(card.data.tags)
+        assert card.content.count("# Model Card for") == 1
+        assert "From one observation it plans 19 actions" in card.content
+        assert "`lerobot_policy_hdp`" in card.content
+        assert "| `observation.environment_state` |" in card.content
+        prompt = 'hdp-plan --policy.path=me/sorter --prompt="_ A"'
+        assert (prompt in card.content) == (planner in WITH_SYMBOLS)
+        if planner in WITH_SYMBOLS:
+            given = policy.read_prompt(inputs, "_ A").token_ids
+            assert policy.vocabulary.symbols[given[0, 1]] == "A"
 
     def test_plans_are_of_the_tasks_shape(self, make_planner, batch, planner):
         policy, preprocessor, postprocessor = make_planner(planner)

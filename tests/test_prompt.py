@@ -143,8 +143,14 @@ class TestThroughThePolicy:
         assert plan.symbols(0)[:2] == ["PICK", "A"]
         assert plan.symbols(1)[:2] == ["PICK", "B"]
         assert plan.symbols(3)[-3:] == ["PLACE", "A", "S1"]
+
+    @pytest.mark.parametrize("num_candidates", [1, 3])
+    def test_too_few_prompts_are_counted_as_they_were_given(self, make_planner, inputs, num_candidates):
+        policy, *_ = make_planner()
         with pytest.raises(ValueError, match="2 prompts for 4 observations"):
-            policy.plan(inputs, ["PICK A", "PICK B"])
+            policy.eval().plan(inputs, ["PICK A", "PICK B"], num_candidates=num_candidates)
+        with pytest.raises(ValueError, match=r"token_ids must have the shape \(4, 18\)"):
+            policy.plan(inputs, PlanPrompt(torch.zeros(2, 18, dtype=torch.int64)), num_candidates=num_candidates)
 
     def test_a_plan_may_end_where_the_planners_room_does(self, make_planner, inputs):
         """Its plans have 18 symbols at most; an untrained planner finds all lengths equally likely."""
