@@ -49,15 +49,16 @@ CHANGES: dict[str, dict[str, Any]] = {
 }
 VARIANTS = (*OF_THE_PAPERS_TABLES, *CHANGES)
 WHAT_FOLLOWS = """
-So the `default` preset predicts the clean motion, masks by the linear schedule, has no dropout, trains on whole plans and
-does not give symbols more weight than 1/300 (1/1000 is not clearly better: it is ahead at one learning rate and behind at
-the other). Two settings make no difference here: rotary positions, which stay off, and the moving average of the weights,
-which stays on, as in Diffusion Policy.
+So the `default` preset predicts the clean motion, has a condition token for each object, made by large initial
+weights, masks by the linear schedule, has no dropout, trains on whole plans and does not give symbols more weight
+than 1/300 (1/1000 is not clearly better: it is ahead at one learning rate and behind at the other). Two settings make
+no difference here: rotary positions, which stay off, and the moving average of the weights, which stays on, as in
+Diffusion Policy.
 
-The learning rate matters most. This small network learns best at 2e-3: set `--policy.optimizer_lr=2e-3` for networks of a
-width around 128. The preset's 1e-3 is meant for its width of 256, where half the rate is the rule of thumb (a rate that
-falls with the width: Yang et al. 2022, "Tensor Programs V"); it has not been compared there, for want of a GPU. The tables
-of [results](results.md) and [planners](planner_comparison.md) have 1e-3 for all planners.
+The learning rate matters most. This small network learns best at 2e-3: set `--policy.optimizer_lr=2e-3` for networks
+of a width around 128. The preset's 1e-3 is meant for its width of 256, where half the rate is the rule of thumb (a
+rate that falls with the width: Yang et al. 2022, "Tensor Programs V"); it has not been compared there, for want of a
+GPU. The tables of [results](results.md) and [planners](planner_comparison.md) have 1e-3 for all planners.
 """
 
 
@@ -95,7 +96,9 @@ def write_page() -> None:
         f"mean over the last {first.average_last} evaluations of {first.starts} fresh starts, whose 95 % interval "
         f"reaches about 5 points to each side. One setting of the `default` preset is changed at a time. 2D sorting, "
         f"{first.demonstrations} demonstrations, {first.policy['num_layers']} layers of width {first.policy['width']}. "
-        "`python -m benchmarks.ablations`\n\n" + markdown_table(["setting", *(f"{n} blocks" for n in BLOCKS)], rows) + WHAT_FOLLOWS
+        "`python -m benchmarks.ablations`\n\n"
+        + markdown_table(["setting", *(f"{n} blocks" for n in BLOCKS)], rows)
+        + WHAT_FOLLOWS
     )
 
 
