@@ -58,7 +58,8 @@ Diffusion Policy.
 The learning rate matters most. This small network learns best at 2e-3: set `--policy.optimizer_lr=2e-3` for networks
 of a width around 128. The preset's 1e-3 is meant for its width of 256, where half the rate is the rule of thumb (a
 rate that falls with the width: Yang et al. 2022, "Tensor Programs V"); it has not been compared there, for want of a
-GPU. The tables of [results](results.md) and [planners](planner_comparison.md) have 1e-3 for all planners.
+GPU. The tables of [results](results.md) and [planners](planner_comparison.md) have 1e-3 for all planners, and 5e-4
+where the noise is predicted; so have the two rows of `prediction_type=epsilon` here, which change two settings.
 """
 
 
