@@ -39,6 +39,10 @@ CHANGES: dict[str, dict[str, Any]] = {
     "plan_from=any_frame": {"plan_from": "any_frame"},
     "object_tokens=false": {"object_tokens": False},
     "observation_weight_std=0.02": {"observation_weight_std": 0.02},
+    "state_encoder_hidden_dim=256, observation_weight_std=2": {
+        "state_encoder_hidden_dim": 256,
+        "observation_weight_std": 2.0,
+    },
     "optimizer_lr=5e-4": {"optimizer_lr": 5e-4},
     "optimizer_lr=2e-3": {"optimizer_lr": 2e-3},
     "optimizer_lr=2e-3, symbol_loss_weight=1/1000": {"optimizer_lr": 2e-3, "symbol_loss_weight": 1 / 1000},

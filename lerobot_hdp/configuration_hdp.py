@@ -74,8 +74,9 @@ class HDPConfig(PreTrainedConfig):
         object_tokens: True makes a condition token of each object in `observation.environment_state` (its components
             are named `object.component` in the dataset) and one of each other observation; False makes one of all.
         observation_token_sizes: how many numbers become each condition token; follows from the dataset.
-        observation_weight_std: size of the initial weights that make condition tokens of the observations. Small ones
-            are Diffusion Policy's; with them, fine differences in position are learned late.
+        state_encoder_hidden_dim: hidden units of the MLP that makes a condition token; 0: a linear layer makes it.
+        observation_weight_std: size of the initial weights that the observations meet first. Small ones are Diffusion
+            Policy's; with them, fine differences in position are learned late.
         num_train_timesteps: N, steps of the Gaussian process.
         prediction_type: what is predicted of the motion: `epsilon` (the noise), `sample` (the clean motion) or
             `v_prediction`.
@@ -125,6 +126,7 @@ class HDPConfig(PreTrainedConfig):
     rotary: bool = False
     object_tokens: bool | None = None
     observation_token_sizes: list[int] | None = None
+    state_encoder_hidden_dim: int = 0
     observation_weight_std: float | None = None
     num_train_timesteps: int = 100
     prediction_type: str | None = None
@@ -183,6 +185,8 @@ class HDPConfig(PreTrainedConfig):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ParsingError(f"{name} must be at least 1, got {value}")
+        if self.state_encoder_hidden_dim < 0:
+            raise ParsingError(f"state_encoder_hidden_dim must be at least 0, got {self.state_encoder_hidden_dim}")
         if self.horizon and self.n_action_steps and self.n_action_steps > self.horizon:
             raise ParsingError(f"n_action_steps={self.n_action_steps} is more than the plan has ({self.horizon=})")
         if self.num_inference_steps > self.num_train_timesteps:

@@ -18,17 +18,29 @@ class StateEncoder(nn.Module):
         keys: names of the observations, in the order in which they are concatenated.
         token_sizes: size of each part.
         width: size of a token.
-        weight_std: standard deviation of the initial weights.
+        weight_std: standard deviation of the initial weights that an observation meets first.
+        hidden_dim: 0 makes a token by a linear layer, more by an MLP with as many hidden units. Their initial weights
+            and thresholds are spread over `weight_std`, so that they respond to observations that differ by about
+            1 / `weight_std`: fine positions are learned early (Tancik et al. 2020, "Fourier features let networks
+            learn high frequency functions in low dimensional domains").
     """
 
-    def __init__(self, keys: Iterable[str], token_sizes: Iterable[int], width: int, weight_std: float):
+    def __init__(
+        self, keys: Iterable[str], token_sizes: Iterable[int], width: int, weight_std: float, hidden_dim: int = 0
+    ):
         super().__init__()
         self.keys = list(keys)
         self.token_sizes = list(token_sizes)
-        self.projections = nn.ModuleList(nn.Linear(size, width) for size in self.token_sizes)
-        for projection in self.projections:
-            nn.init.normal_(projection.weight, std=weight_std)
-            nn.init.zeros_(projection.bias)
+        self.projections = nn.ModuleList()
+        for size in self.token_sizes:
+            first = nn.Linear(size, hidden_dim or width)
+            nn.init.normal_(first.weight, std=weight_std)
+            if hidden_dim:
+                nn.init.uniform_(first.bias, -weight_std, weight_std)
+                self.projections.append(nn.Sequential(first, nn.GELU(), nn.Linear(hidden_dim, width)))
+            else:
+                nn.init.zeros_(first.bias)
+                self.projections.append(first)
 
     @property
     def num_tokens(self) -> int:

@@ -33,7 +33,11 @@ class Planner(nn.Module):
     def __init__(self, config: HDPConfig, symbol_states: int):
         super().__init__()
         self.encoder = StateEncoder(
-            config.input_features, config.observation_token_sizes, config.width, config.observation_weight_std
+            config.input_features,
+            config.observation_token_sizes,
+            config.width,
+            config.observation_weight_std,
+            config.state_encoder_hidden_dim,
         )
         self.denoiser = Denoiser(
             action_dim=config.action_feature.shape[0],

@@ -31,9 +31,10 @@ def test_each_object_is_a_condition_token_of_its_own(make_planner):
     assert make_planner(object_tokens=False)[0].config.observation_token_sizes == [7]
 
 
+@pytest.mark.parametrize("hidden_dim", [0, 16])
 @pytest.mark.parametrize("object_tokens", [True, False])
-def test_a_plan_depends_on_every_observation(make_planner, batch, object_tokens):
-    policy, preprocessor, _ = make_planner(object_tokens=object_tokens)
+def test_a_plan_depends_on_every_observation(make_planner, batch, object_tokens, hidden_dim):
+    policy, preprocessor, _ = make_planner(object_tokens=object_tokens, state_encoder_hidden_dim=hidden_dim)
     inputs = observation(preprocessor(batch))
     encoder = policy.planner.encoder
     for key, tensor in inputs.items():
@@ -41,6 +42,15 @@ def test_a_plan_depends_on_every_observation(make_planner, batch, object_tokens)
             changed = {**inputs, key: tensor.clone()}
             changed[key][:, component] += 0.5
             assert not torch.equal(encoder(changed), encoder(inputs))
+
+
+@pytest.mark.parametrize(("hidden_dim", "is_linear"), [(0, True), (16, False)])
+def test_a_state_encoder_with_hidden_units_is_not_linear(make_planner, batch, hidden_dim, is_linear):
+    policy, preprocessor, _ = make_planner(state_encoder_hidden_dim=hidden_dim)
+    near = observation(preprocessor(batch))
+    far, between = ({key: tensor + shift for key, tensor in near.items()} for shift in (1.0, 0.5))
+    encode = policy.planner.encoder
+    assert torch.allclose(encode(between), (encode(near) + encode(far)) / 2, atol=1e-5) == is_linear
 
 
 def test_tokens_survive_from_the_dataset_to_the_model_and_back_to_words(make_planner, batch, dataset):
@@ -330,6 +340,7 @@ class TestBadInput:
             {"horizon": 10, "n_action_steps": 11},
             {"num_inference_steps": 101},
             {"num_candidates": 0},
+            {"state_encoder_hidden_dim": -1},
         ],
     )
     def test_impossible_settings(self, field):

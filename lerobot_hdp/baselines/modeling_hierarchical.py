@@ -28,7 +28,9 @@ class HierarchicalPlanner(nn.Module):
         segment_size = config.subgoal_interval * config.action_feature.shape[0]
 
         def encoder(token_sizes: list[int]) -> StateEncoder:
-            return StateEncoder(["state"], token_sizes, config.width, config.observation_weight_std)
+            return StateEncoder(
+                ["state"], token_sizes, config.width, config.observation_weight_std, config.state_encoder_hidden_dim
+            )
 
         def denoiser(value_size: int, horizon: int, condition_tokens: int) -> Denoiser:
             return Denoiser(
