@@ -1,4 +1,4 @@
-"""What helps HDP to learn: one setting changed at a time, with the same samples seen, on 2D sorting.
+"""What helps HDP to learn: one setting changed at a time, with the same samples seen.
 
 python -m benchmarks.ablations              # runs what is missing, then writes docs/ablations.md
 python -m benchmarks.ablations --list       # says what is finished and what is not
@@ -10,6 +10,7 @@ holds all finished cells, whatever was chosen to be run.
 
 import argparse
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import product
 from statistics import mean
@@ -20,12 +21,19 @@ from .pages import DOCS, markdown_table
 from .paper.presets import make_cell
 
 PAGE = DOCS / "ablations.md"
-BLOCKS = (3, 4)
+TASKS = {
+    "3_blocks": "block_sorting_2d_3_blocks",
+    "4_blocks": "block_sorting_2d_4_blocks",
+    "arrange": "xarm_arrange_blocks",
+}
+"""What a cell's name begins with, and the task of the `mini` preset."""
 SEEDS = (0, 1)
 NOISE = {"prediction_type": "epsilon", "optimizer_lr": 5e-4}
 """Noise prediction, at the learning rate of the preset `mini_epsilon`."""
+MLP_ENCODER = {"state_encoder_hidden_dim": 256, "observation_weight_std": 2.0}
 OF_THE_PAPERS_TABLES = {"default": "mini", "prediction_type=epsilon, symbol_loss_weight=1/30": "mini_epsilon"}
 """Variants that are cells of `benchmarks.paper` already, and of which preset."""
+IN_NO_PRESET = {("prediction_type=epsilon, symbol_loss_weight=1/30", "arrange")}
 CHANGES: dict[str, dict[str, Any]] = {
     "prediction_type=epsilon": NOISE,
     "prediction_type=v_prediction": {"prediction_type": "v_prediction"},
@@ -39,10 +47,9 @@ CHANGES: dict[str, dict[str, Any]] = {
     "plan_from=any_frame": {"plan_from": "any_frame"},
     "object_tokens=false": {"object_tokens": False},
     "observation_weight_std=0.02": {"observation_weight_std": 0.02},
-    "state_encoder_hidden_dim=256, observation_weight_std=2": {
-        "state_encoder_hidden_dim": 256,
-        "observation_weight_std": 2.0,
-    },
+    "state_encoder_hidden_dim=256, observation_weight_std=2": MLP_ENCODER,
+    "rotary=true, state_encoder_hidden_dim=256, observation_weight_std=2": {"rotary": True, **MLP_ENCODER},
+    "rotary=true, optimizer_lr=2e-3": {"rotary": True, "optimizer_lr": 2e-3},
     "optimizer_lr=5e-4": {"optimizer_lr": 5e-4},
     "optimizer_lr=2e-3": {"optimizer_lr": 2e-3},
     "optimizer_lr=2e-3, symbol_loss_weight=1/1000": {"optimizer_lr": 2e-3, "symbol_loss_weight": 1 / 1000},
@@ -67,56 +74,70 @@ where the noise is predicted; so have the two rows of `prediction_type=epsilon` 
 """
 
 
-def variant_of(name: str, n_blocks: int, seed: int) -> Cell:
-    """The cell of a variant, a number of blocks and a seed."""
-    cell = make_cell(OF_THE_PAPERS_TABLES.get(name, "mini"), f"block_sorting_2d_{n_blocks}_blocks", "hdp", seed)
+def variant_of(name: str, task: str, seed: int) -> Cell:
+    """The cell of a variant, one of `TASKS` and a seed.
+
+    Raises:
+        KeyError: there is no such variant of the task.
+    """
+    cell = make_cell(OF_THE_PAPERS_TABLES.get(name, "mini"), TASKS[task], "hdp", seed)
     if name in OF_THE_PAPERS_TABLES:
         return cell
     return replace(
         cell,
         group="ablations",
-        name=f"{n_blocks}_blocks_{name.replace(', ', '_').replace('/', '_')}_seed{seed}",
+        name=f"{task}_{name.replace(', ', '_').replace('/', '_')}_seed{seed}",
         policy={**cell.policy, **CHANGES[name]},
         facts={"variant": name},
     )
 
 
+def variants(names: Iterable[str], tasks: Iterable[str], seeds: Iterable[int]) -> dict[tuple[str, str, int], Cell]:
+    """The cells of these variants, tasks and seeds, without those that no preset has."""
+    choices = [choice for choice in product(names, tasks, seeds) if choice[:2] not in IN_NO_PRESET]
+    return {choice: variant_of(*choice) for choice in choices}
+
+
 def write_page() -> None:
     """The table of all finished cells."""
-    cells = {choice: variant_of(*choice) for choice in product(VARIANTS, BLOCKS, SEEDS)}
-    scores: dict[tuple[str, int], list[float]] = defaultdict(list)
-    for (variant, n_blocks, _), cell in cells.items():
+    cells = variants(VARIANTS, TASKS, SEEDS)
+    scores: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for (variant, task, _), cell in cells.items():
         if content := read_result(cell):
             rates = [point["success_rate"] for point in content["result"]["curve"][-cell.average_last :]]
-            scores[variant, n_blocks].append(100 * mean(rates))
-    first, steps = next(iter(cells.values())), {n_blocks: cell.steps for (_, n_blocks, _), cell in cells.items()}
-    budgets = " and ".join(f"{steps[n]:,} steps with {n} blocks" for n in BLOCKS)
+            scores[variant, task].append(f"{100 * mean(rates):.0f}")
     rows = [
-        [f"`{variant}`", *(", ".join(f"{score:.0f}" for score in scores[variant, n]) or "not run" for n in BLOCKS)]
-        for variant in VARIANTS
+        [f"`{variant}`", *(", ".join(scores[variant, task]) or "not run" for task in TASKS)] for variant in VARIANTS
     ]
+    budgets = [_budget(variant_of("default", task, SEEDS[0])) for task in TASKS]
+    first = next(iter(cells.values()))
     PAGE.write_text(
         "# What helps HDP to learn\n\n"
-        f"Success in % in the middle of learning: {budgets}, of {first.batch_size} samples each. For each seed, the "
-        f"mean over the last {first.average_last} evaluations of {first.starts} fresh starts, whose 95 % interval "
-        f"reaches about 5 points to each side. One setting of the `default` preset is changed at a time. 2D sorting, "
-        f"{first.demonstrations} demonstrations, {first.policy['num_layers']} layers of width {first.policy['width']}. "
-        "`python -m benchmarks.ablations`\n\n"
-        + markdown_table(["setting", *(f"{n} blocks" for n in BLOCKS)], rows)
+        f"Success in % in the middle of learning; for each seed, the mean over the last {first.average_last} "
+        f"evaluations of {first.starts} fresh starts, whose 95 % interval reaches about 5 points to each side. One "
+        "setting is changed at a time, or those that are named. `python -m benchmarks.ablations`\n\n"
+        + markdown_table(["task", "demonstrations", "steps", "samples a step", "layers", "width"], budgets)
+        + "\n"
+        + markdown_table(["setting", *(TASKS[task] for task in TASKS)], rows)
         + WHAT_FOLLOWS
     )
 
 
+def _budget(cell: Cell) -> list[str]:
+    network = cell.policy["num_layers"], cell.policy["width"]
+    numbers = (cell.demonstrations, cell.steps, cell.batch_size, *network)
+    return [cell.facts["task_name"], *(f"{number:,}" for number in numbers)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--n_blocks", type=int, nargs="+", default=BLOCKS, choices=BLOCKS)
+    parser.add_argument("--tasks", nargs="+", default=tuple(TASKS), choices=tuple(TASKS))
     parser.add_argument("--variants", nargs="+", default=VARIANTS, choices=VARIANTS)
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS, choices=SEEDS)
     parser.add_argument("--processes", type=int, default=1, help="cells at a time, which share the cores")
     parser.add_argument("--list", action="store_true")
     options = parser.parse_args()
-    cells = [variant_of(*choice) for choice in product(options.variants, options.n_blocks, options.seeds)]
-    cells.sort(key=lambda cell: cell.seed)
+    cells = sorted(variants(options.variants, options.tasks, options.seeds).values(), key=lambda cell: cell.seed)
     if options.list:
         for cell in cells:
             print(f"{cell.name:75} {cell.state()}")
