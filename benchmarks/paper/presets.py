@@ -90,6 +90,18 @@ PRESETS: dict[str, Preset] = {
             "xarm_tool_use": Training(4_000, 60_000, 64),
         },
     ),
+    # The same network as `mini` for the X-Arm, and as much data and training as a core carries in an hour or so.
+    "small": Preset(
+        policy={"preset": "default", "dtype": "bfloat16", "rotary": True, **_MINI_XARM},
+        tasks={
+            "xarm_sorting": Training(200, 6_000, 50),
+            "xarm_arrange_blocks": Training(4_000, 40_000, 50),
+            "xarm_tool_use": Training(1_000, 6_000, 50),
+        },
+        evaluations=10,
+        starts=100,
+        average_last=3,
+    ),
     # What two cores do in minutes a cell: a network of a tenth of the size.
     "mini": Preset(
         policy={"preset": "default", "dtype": "bfloat16"},
