@@ -92,7 +92,14 @@ PRESETS: dict[str, Preset] = {
     ),
     # The same network as `mini` for the X-Arm, and as much data and training as a core carries in an hour or so.
     "small": Preset(
-        policy={"preset": "default", "dtype": "bfloat16", "rotary": True, **_MINI_XARM},
+        policy={
+            "preset": "default",
+            "dtype": "bfloat16",
+            "rotary": True,
+            "state_encoder_hidden_dim": 256,
+            "observation_weight_std": 2.0,
+            **_MINI_XARM,
+        },
         tasks={
             "xarm_sorting": Training(200, 6_000, 50),
             "xarm_arrange_blocks": Training(4_000, 40_000, 50),
