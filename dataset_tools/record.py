@@ -12,6 +12,7 @@ import os
 import shutil
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
@@ -312,7 +313,7 @@ def record(config: RecordConfig) -> LeRobotDataset:
                 record_shard(config, shard, progress)
         else:
             context = multiprocessing.get_context("forkserver")
-            with ProcessPoolExecutor(config.num_workers, context, initializer=exit_when_terminated) as executor:
+            with ProcessPoolExecutor(config.num_workers, context, initializer=end_with_parent) as executor:
                 futures = {executor.submit(record_shard_in_worker, config, shard): shard for shard in shards}
                 try:
                     for future in as_completed(futures):
@@ -362,6 +363,19 @@ def try_environment(config: RecordConfig) -> None:
 def exit_when_terminated() -> None:
     """Leave by an exception on SIGTERM, so that what is finished is kept."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("hdp-record: terminated; go on with --resume=true"))
+
+
+def end_with_parent() -> None:
+    """Leave as on SIGTERM when the process that asked for this one is gone, even if it was killed."""
+    exit_when_terminated()
+
+    def wait_for_the_end() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=wait_for_the_end, daemon=True).start()
 
 
 def plan_shards(config: RecordConfig) -> list[Shard]:

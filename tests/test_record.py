@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -113,7 +114,8 @@ def uninterrupted(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("signal_number", "num_workers"), [(signal.SIGTERM, 1), (signal.SIGKILL, 1), (signal.SIGTERM, 2)]
+    ("signal_number", "num_workers"),
+    [(signal.SIGTERM, 1), (signal.SIGKILL, 1), (signal.SIGTERM, 2), (signal.SIGKILL, 2)],
 )
 def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_path, signal_number, num_workers):
     flags = flags_of_80(tmp_path / "stopped")
@@ -123,8 +125,11 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_pa
     while not first_shard_done.exists():
         assert process.poll() is None
         time.sleep(0.01)
+    workers = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal_number)
     process.wait()
+    _, still_running = psutil.wait_procs(workers, timeout=20)
+    assert not still_running
     assert not (tmp_path / "stopped").exists()
     assert not first_shard_done.with_name("episodes_000075.done").exists()
     assert json.loads((first_shard_done.with_suffix("") / "meta/info.json").read_text())["total_episodes"] == 25
