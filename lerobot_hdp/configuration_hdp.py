@@ -26,6 +26,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "default": {
         "prediction_type": "sample",
         "dropout": 0.0,
+        "rotary": True,
         "object_tokens": True,
         "observation_weight_std": 0.5,
         "symbol_loss_weight": 1 / 300,
@@ -39,6 +40,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "prediction_type": "epsilon",
         "dropout": 0.3,
+        "rotary": False,
         "object_tokens": False,
         "observation_weight_std": 0.02,
         "symbol_loss_weight": 1 / 30,
@@ -70,7 +72,8 @@ class HDPConfig(PreTrainedConfig):
         vocabulary: the symbols, PAD first; read from the dataset.
 
         num_layers, num_heads, width, dropout: the transformer; `width` is the size of a token.
-        rotary: rotary position embedding in self-attention, beside the learned vectors of the positions.
+        rotary: rotary position embedding in self-attention, beside the learned vectors of the positions. It tells the
+            symbols which part of the motion is theirs.
         object_tokens: True makes a condition token of each object in `observation.environment_state` (its components
             are named `object.component` in the dataset) and one of each other observation; False makes one of all.
         observation_token_sizes: how many numbers become each condition token; follows from the dataset.
@@ -123,7 +126,7 @@ class HDPConfig(PreTrainedConfig):
     num_heads: int = 4
     width: int = 256
     dropout: float | None = None
-    rotary: bool = False
+    rotary: bool | None = None
     object_tokens: bool | None = None
     observation_token_sizes: list[int] | None = None
     state_encoder_hidden_dim: int = 0

@@ -27,7 +27,7 @@ TITLES = {
     "paper": "The paper's hyperparameters",
     "default": "Our settings at the paper's network size",
     "small": "Our settings on two CPU cores: a network of a tenth of the size, an hour or so of training",
-    "mini": "Our settings on two CPU cores: a network of a tenth of the size, a small part of the training",
+    "mini": "The same on learned positions alone, a small part of the training",
     "mini_epsilon": "The same, predicting the noise, as the paper does",
 }
 MISSING = "missing"
