@@ -184,8 +184,8 @@ class HDPConfig(PreTrainedConfig):
             raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
         if self.rotary and self.width // self.num_heads % 2:
             raise ParsingError(
-                f"rotary embedding needs an even width / num_heads, got {self.width} / {self.num_heads}: choose another "
-                "width, or rotary=false"
+                f"rotary embedding needs an even width / num_heads, got {self.width} / {self.num_heads}: "
+                "choose another width, or rotary=false"
             )
         for name in ("horizon", "symbolic_horizon", "n_action_steps", "num_inference_steps", "num_candidates"):
             value = getattr(self, name)
