@@ -1,4 +1,4 @@
-"""What helps HDP to learn: one setting changed at a time, with the same samples seen.
+"""What helps HDP to learn: one setting changed at a time, or two, with the same samples seen.
 
 python -m benchmarks.ablations              # runs what is missing, then writes docs/ablations.md
 python -m benchmarks.ablations --list       # says what is finished and what is not
@@ -18,7 +18,7 @@ from typing import Any
 
 from .cells import Cell, read_result, run_cells
 from .pages import DOCS, markdown_table
-from .paper.presets import make_cell
+from .paper.presets import PRESETS, make_cell
 
 PAGE = DOCS / "ablations.md"
 TASKS = {
@@ -34,7 +34,6 @@ NOISE = {"prediction_type": "epsilon", "optimizer_lr": 5e-4}
 MLP_ENCODER = {"state_encoder_hidden_dim": 256, "observation_weight_std": 2.0}
 OF_THE_PAPERS_TABLES = {"rotary=false": "mini", "prediction_type=epsilon, symbol_loss_weight=1/30": "mini_epsilon"}
 """Variants that are cells of `benchmarks.paper` already, and of which preset."""
-IN_NO_PRESET = {("prediction_type=epsilon, symbol_loss_weight=1/30", task) for task in ("arrange", "tool_use")}
 CHANGES: dict[str, dict[str, Any]] = {
     "prediction_type=epsilon": NOISE,
     "prediction_type=v_prediction": {"prediction_type": "v_prediction"},
@@ -84,13 +83,18 @@ change two settings.
 """
 
 
+def preset_of(name: str) -> str:
+    """The preset of the paper's tables that a variant belongs to, or changes."""
+    return OF_THE_PAPERS_TABLES.get(name, "mini")
+
+
 def variant_of(name: str, task: str, seed: int) -> Cell:
     """The cell of a variant, one of `TASKS` and a seed.
 
     Raises:
-        KeyError: there is no such variant of the task.
+        KeyError: the variant's preset has no such task.
     """
-    cell = make_cell(OF_THE_PAPERS_TABLES.get(name, "mini"), TASKS[task], "hdp", seed)
+    cell = make_cell(preset_of(name), TASKS[task], "hdp", seed)
     if name in OF_THE_PAPERS_TABLES:
         return cell
     return replace(
@@ -103,9 +107,11 @@ def variant_of(name: str, task: str, seed: int) -> Cell:
 
 
 def variants(names: Iterable[str], tasks: Iterable[str], seeds: Iterable[int]) -> dict[tuple[str, str, int], Cell]:
-    """The cells of these variants, tasks and seeds, without those that no preset has."""
-    choices = [choice for choice in product(names, tasks, seeds) if choice[:2] not in IN_NO_PRESET]
-    return {choice: variant_of(*choice) for choice in choices}
+    """The cells of these variants, tasks and seeds, of those tasks that the variant's preset has."""
+    choices = product(names, tasks, seeds)
+    return {
+        choice: variant_of(*choice) for choice in choices if TASKS[choice[1]] in PRESETS[preset_of(choice[0])].tasks
+    }
 
 
 def write_page() -> None:
@@ -119,17 +125,16 @@ def write_page() -> None:
     rows = [
         [f"`{variant}`", *(", ".join(scores[variant, task]) or "not run" for task in TASKS)] for variant in VARIANTS
     ]
-    budgets = [_budget(variant_of(VARIANTS[0], task, SEEDS[0])) for task in TASKS]
-    first = next(iter(cells.values()))
+    bases = [cells[VARIANTS[0], task, SEEDS[0]] for task in TASKS]
     PAGE.write_text(
         "# What helps HDP to learn\n\n"
-        f"Success in % in the middle of learning; for each seed, the mean over the last {first.average_last} "
-        f"evaluations of {first.starts} fresh starts, whose 95 % interval reaches about 5 points to each side. The "
+        f"Success in % in the middle of learning; for each seed, the mean over the last {bases[0].average_last} "
+        f"evaluations of {bases[0].starts} fresh starts, whose 95 % interval reaches about 5 points to each side. The "
         "first row is the `default` preset with learned positions alone; in the others, what is named is changed. "
         "`python -m benchmarks.ablations`\n\n"
-        + markdown_table(["task", "demonstrations", "steps", "samples a step", "layers", "width"], budgets)
+        + markdown_table(["task", "demonstrations", "steps", "samples a step", "layers", "width"], map(_budget, bases))
         + "\n"
-        + markdown_table(["setting", *(TASKS[task] for task in TASKS)], rows)
+        + markdown_table(["setting", *TASKS.values()], rows)
         + WHAT_FOLLOWS
     )
 

@@ -10,14 +10,13 @@ import math
 import os
 import shutil
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from typing import Any
 import torch
 from lerobot.scripts import lerobot_train
 
-from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
+from dataset_tools.record import RecordConfig, RecordDatasetConfig, record, when_parent_ends
 from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.scripts import hdp_train
@@ -425,16 +424,8 @@ def _run_with_log(log: Path, threads: int, function: Callable[..., None], *argum
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     torch.set_num_threads(threads)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    when_parent_ends(lambda: os._exit(1))
     function(*arguments)
-
-
-def _end_with_parent() -> None:
-    """A child of the fork server would outlive the process that asked for it, if that is killed."""
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from itertools import count
@@ -365,17 +365,25 @@ def exit_when_terminated() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("hdp-record: terminated; go on with --resume=true"))
 
 
-def end_with_parent() -> None:
-    """Leave as on SIGTERM when the process that asked for this one is gone, even if it was killed."""
-    exit_when_terminated()
+def when_parent_ends(action: Callable[[], None]) -> None:
+    """Do something as soon as the process that asked for this one is gone, even if it was killed.
 
-    def wait_for_the_end() -> None:
+    A child of a fork server would outlive it.
+    """
+
+    def wait() -> None:
         parent = multiprocessing.parent_process()
         assert parent is not None
         parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)
+        action()
 
-    threading.Thread(target=wait_for_the_end, daemon=True).start()
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def end_with_parent() -> None:
+    """Leave as on SIGTERM when the parent is gone."""
+    exit_when_terminated()
+    when_parent_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))
 
 
 def plan_shards(config: RecordConfig) -> list[Shard]:

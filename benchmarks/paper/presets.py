@@ -95,7 +95,6 @@ PRESETS: dict[str, Preset] = {
         policy={
             "preset": "default",
             "dtype": "bfloat16",
-            "rotary": True,
             "state_encoder_hidden_dim": 256,
             "observation_weight_std": 2.0,
             **_MINI_XARM,

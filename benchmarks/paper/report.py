@@ -26,8 +26,8 @@ TASKS_2D = {f"block_sorting_2d_{n}_blocks": f"{n} blocks" for n in (2, 3, 4)}
 TITLES = {
     "paper": "The paper's hyperparameters",
     "default": "Our settings at the paper's network size",
-    "small": "Our settings on two CPU cores: a network of a tenth of the size, an hour or so of training",
-    "mini": "The same on learned positions alone, a small part of the training",
+    "small": "On two CPU cores: a network of a tenth of the size, condition tokens by an MLP, an hour of training",
+    "mini": "On two CPU cores: a network of a tenth of the size, learned positions alone, minutes of training",
     "mini_epsilon": "The same, predicting the noise, as the paper does",
 }
 MISSING = "missing"
