@@ -31,7 +31,6 @@ TASKS = {
 SEEDS = (0, 1)
 NOISE = {"prediction_type": "epsilon", "optimizer_lr": 5e-4}
 """Noise prediction, at the learning rate of the preset `mini_epsilon`."""
-MLP_ENCODER = {"state_encoder_hidden_dim": 256, "observation_weight_std": 2.0}
 OF_THE_PAPERS_TABLES = {"rotary=false": "mini", "prediction_type=epsilon, symbol_loss_weight=1/30": "mini_epsilon"}
 """Variants that are cells of `benchmarks.paper` already, and of which preset."""
 CHANGES: dict[str, dict[str, Any]] = {
@@ -47,8 +46,11 @@ CHANGES: dict[str, dict[str, Any]] = {
     "plan_from=any_frame": {"plan_from": "any_frame"},
     "object_tokens=false": {"object_tokens": False},
     "observation_weight_std=0.02": {"observation_weight_std": 0.02},
-    "state_encoder_hidden_dim=256, observation_weight_std=2": MLP_ENCODER,
-    "rotary=true, state_encoder_hidden_dim=256, observation_weight_std=2": {"rotary": True, **MLP_ENCODER},
+    "rotary=true, state_encoder_hidden_dim=256, observation_weight_std=2": {
+        "rotary": True,
+        "state_encoder_hidden_dim": 256,
+        "observation_weight_std": 2.0,
+    },
     "rotary=true, optimizer_lr=2e-3": {"rotary": True, "optimizer_lr": 2e-3},
     "optimizer_lr=5e-4": {"optimizer_lr": 5e-4},
     "optimizer_lr=2e-3": {"optimizer_lr": 2e-3},
@@ -74,12 +76,16 @@ weights, masks by the linear schedule, has no dropout, trains on whole plans and
 1/300 (1/1000 is ahead at one learning rate and behind at the other). The moving average of the weights makes no
 difference that two seeds could show, and stays on, as in Diffusion Policy.
 
-The learning rate matters most. This small network learns sorting best at 2e-3: set `--policy.optimizer_lr=2e-3` for
-networks of a width around 128. The preset's 1e-3 is meant for its width of 256, where half the rate is the rule of
-thumb (a rate that falls with the width: Yang et al. 2022, "Tensor Programs V"); it has not been compared there, for
-want of a GPU. The tables of [results](results.md) and [planners](planner_comparison.md) have learned positions and 1e-3
-for all planners, and 5e-4 where the noise is predicted; so have the two rows of `prediction_type=epsilon` here, which
-change two settings.
+**The learning rate** is 1e-3. With learned positions alone, this small network learns sorting better at 2e-3; with
+rotary positions as well, it does not. Larger networks want smaller rates as a rule (Yang et al. 2022, "Tensor Programs
+V"); at the preset's width of 256 it has not been compared, for want of a GPU.
+
+**An MLP** in place of the linear layer that makes the condition tokens (`state_encoder_hidden_dim`) does no harm, and
+shows no gain that two seeds could tell from chance. It is off by default.
+
+The tables of [results](results.md) and [planners](planner_comparison.md) have learned positions and 1e-3 for all
+planners, and 5e-4 where the noise is predicted; so have the two rows of `prediction_type=epsilon` here, which change
+two settings.
 """
 
 
@@ -117,19 +123,19 @@ def variants(names: Iterable[str], tasks: Iterable[str], seeds: Iterable[int]) -
 def write_page() -> None:
     """The table of all finished cells."""
     cells = variants(VARIANTS, TASKS, SEEDS)
-    scores: dict[tuple[str, str], list[str]] = defaultdict(list)
+    scores: dict[tuple[str, str], list[float]] = defaultdict(list)
     for (variant, task, _), cell in cells.items():
         if content := read_result(cell):
             rates = [point["success_rate"] for point in content["result"]["curve"][-cell.average_last :]]
-            scores[variant, task].append(f"{100 * mean(rates):.0f}")
-    rows = [
-        [f"`{variant}`", *(", ".join(scores[variant, task]) or "not run" for task in TASKS)] for variant in VARIANTS
-    ]
+            scores[variant, task].append(100 * mean(rates))
+    rows = [[f"`{variant}`", *(_each(scores[variant, task]) for task in TASKS)] for variant in VARIANTS]
+    spread = max(max(seeds) - min(seeds) for seeds in list(scores.values()) if seeds)
     bases = [cells[VARIANTS[0], task, SEEDS[0]] for task in TASKS]
     PAGE.write_text(
         "# What helps HDP to learn\n\n"
         f"Success in % in the middle of learning; for each seed, the mean over the last {bases[0].average_last} "
-        f"evaluations of {bases[0].starts} fresh starts, whose 95 % interval reaches about 5 points to each side. The "
+        f"evaluations of {bases[0].starts} fresh starts, whose 95 % interval reaches about 5 points to each side; "
+        f"two seeds of one setting differ by up to {spread:.0f} points. The "
         "first row is the `default` preset with learned positions alone; in the others, what is named is changed. "
         "`python -m benchmarks.ablations`\n\n"
         + markdown_table(["task", "demonstrations", "steps", "samples a step", "layers", "width"], map(_budget, bases))
@@ -137,6 +143,10 @@ def write_page() -> None:
         + markdown_table(["setting", *TASKS.values()], rows)
         + WHAT_FOLLOWS
     )
+
+
+def _each(seeds: list[float]) -> str:
+    return ", ".join(f"{score:.0f}" for score in seeds) or "not run"
 
 
 def _budget(cell: Cell) -> list[str]:

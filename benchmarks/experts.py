@@ -21,9 +21,8 @@ import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
 
-from .machine import describe_run
+from .machine import RESULTS, describe_run
 
-RESULTS = Path(__file__).parent / "results"
 XARM_TASKS = [gym_id for gym_id in EXPERTS if "XArm" in gym_id]
 
 

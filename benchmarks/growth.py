@@ -12,9 +12,6 @@ the blocks, horizon and symbols grow together.
 
 import argparse
 import json
-import random
-import statistics
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -32,6 +29,7 @@ from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
 from .machine import RESULTS, describe_run
 from .pages import DOCS, LABELS, markdown_table
 from .planner_latency import make_planner
+from .timing import compare
 
 FILE, PAGE = RESULTS / "growth.json", DOCS / "growth.md"
 HORIZONS = (37, 73, 145, 289, 577)
@@ -95,28 +93,6 @@ def make_plan(policy: PreTrainedPolicy, batch: dict[str, Tensor]) -> None:
         policy.plan({key: batch[key] for key in policy.config.input_features})
 
 
-def in_turns(actions: dict[str, Callable[[], None]], rounds: int) -> dict[str, dict[str, list[float]]]:
-    """Milliseconds of each action and its ratio over the reference."""
-    times: dict[str, list[float]] = {name: [] for name in actions}
-    for turn in range(rounds + 1):
-        for name in random.sample(list(actions), len(actions)):
-            start = time.perf_counter()
-            actions[name]()
-            if turn:  # the first one warms up
-                times[name].append(1000 * (time.perf_counter() - start))
-
-    def quartiles(values: list[float]) -> list[float]:
-        return [float(f"{value:.4g}") for value in statistics.quantiles(values, n=4, method="inclusive")]
-
-    return {
-        name: {
-            "ms": quartiles(own),
-            "ratio": quartiles([one / other for one, other in zip(own, times[REFERENCE], strict=True)]),
-        }
-        for name, own in times.items()
-    }
-
-
 def measure(env: HDPEnv, horizon: int, batch_size: int, rounds: int) -> dict[str, Any]:
     planners = make_planners(env, horizon)
     batches = {name: make_batch(policy, batch_size) for name, policy in planners.items()}
@@ -131,8 +107,8 @@ def measure(env: HDPEnv, horizon: int, batch_size: int, rounds: int) -> dict[str
         "parameters": {
             name: sum(p.numel() for p in policy.parameters() if p.requires_grad) for name, policy in planners.items()
         },
-        "train_step": in_turns(actions(train_step, batches), rounds),
-        "plan": in_turns(actions(make_plan, single), rounds),
+        "train_step": compare(actions(train_step, batches), rounds, REFERENCE),
+        "plan": compare(actions(make_plan, single), rounds, REFERENCE),
     }
 
 
@@ -187,6 +163,7 @@ def main() -> None:
         write_page()
         return
     torch.set_num_threads(options.threads)
+    run = describe_run()
     result: dict[str, Any] = {**NETWORK, "batch_size": options.batch_size, "threads": options.threads}
     result["over_horizon"], result["over_blocks"] = [], []
     for horizon in options.horizons:
@@ -197,7 +174,7 @@ def main() -> None:
         measured = measure(env, env.planning_task.horizon, options.batch_size, options.rounds)
         result["over_blocks"].append({"n_blocks": n_blocks, **measured})
         print(json.dumps(result["over_blocks"][-1]), flush=True)
-    FILE.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+    FILE.write_text(json.dumps({"run": run, "result": result}, indent=2) + "\n")
     write_page()
 
 

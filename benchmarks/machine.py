@@ -30,7 +30,7 @@ def git_commit() -> str:
     """The commit of this code, `+changes` if it was changed since; in a packed folder, what its file `COMMIT` says."""
     if (packed := REPOSITORY / "COMMIT").exists():
         return packed.read_text().strip()
-    changes = _git("status", "--porcelain", "--", "*.py", "*.json", ":!benchmarks/results")
+    changes = _git("status", "--porcelain", "--", "*.py", "*.json", "*.toml", "*.xml", ":!benchmarks/results")
     return _git("rev-parse", "--short", "HEAD") + ("+changes" if changes else "")
 
 

@@ -13,7 +13,6 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -24,9 +23,9 @@ from dataset_tools.experts import EXPERTS
 from gym_hdp_tasks import open_loop
 from gym_hdp_tasks.open_loop import execute_plans
 
-from .machine import describe_run
+from .machine import RESULTS, describe_run
 
-RESULTS = Path(__file__).parent / "results" / "open_loop.json"
+FILE = RESULTS / "open_loop.json"
 SHAKE = 0.02
 """Standard deviation of what is added to half of the plans, in metres and in opening."""
 
@@ -107,7 +106,7 @@ def main() -> None:
         run = describe_run()
         results[gym_id] = {"run": run, **measure(gym_id, options.num_plans, options.num_cores)}
         print(gym_id, json.dumps(results[gym_id], indent=2))
-    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+    FILE.write_text(json.dumps(results, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -10,16 +10,12 @@ level of a planner, fewer than the paper's 100: the ratios depend little on thei
 
 import argparse
 import json
-import random
-import statistics
-import time
-from pathlib import Path
+from functools import partial
 
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from torch import Tensor
 
 import lerobot_policy_hdp  # noqa: F401 (registers the planners)
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, dataset_features
@@ -27,12 +23,12 @@ from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.modeling_hdp import HDPPolicy
 
 from .cells import num_parameters
-from .machine import describe_run
+from .machine import RESULTS, describe_run
 from .pages import DOCS, markdown_table
 from .paper.presets import ENVS, METHODS, PRESETS, make_cell
+from .timing import compare
 
-RESULTS = Path(__file__).parent / "results" / "planner_latency.json"
-PAGE = DOCS / "planner_latency.md"
+FILE, PAGE = RESULTS / "planner_latency.json", DOCS / "planner_latency.md"
 REFERENCE = "diffuser"
 
 
@@ -47,42 +43,23 @@ def make_planner(policy_type: str, env: HDPEnv, **options) -> HDPPolicy:
     return get_policy_class(policy_type)(config).to(config.device).eval()
 
 
-def time_plan(policy: HDPPolicy, batch: dict[str, Tensor]) -> float:
-    """Seconds that a batch of plans takes."""
-    start = time.perf_counter()
-    policy.plan(batch).actions.sum().item()  # waits for an accelerator
-    return time.perf_counter() - start
-
-
-def measure(planners: dict[str, HDPPolicy], batch_size: int, rounds: int) -> dict[str, dict[str, object]]:
-    """Milliseconds of each planner, and their ratios over the reference, as [first quartile, median, third]."""
+def measure(planners: dict[str, HDPPolicy], batch_size: int, rounds: int) -> dict[str, dict[str, list[float]]]:
+    """How long a batch of plans takes each planner, see `compare`."""
     policy = planners[REFERENCE]
     batch = {
         key: torch.rand(batch_size, *feature.shape, device=policy.config.device) * 2 - 1
         for key, feature in policy.config.input_features.items()
     }
-    times: dict[str, list[float]] = {name: [] for name in planners}
-    for round_number in range(rounds + 1):
-        for name in random.sample(list(planners), len(planners)):
-            elapsed = time_plan(planners[name], batch)
-            if round_number:  # the first round warms up
-                times[name].append(elapsed)
 
-    def quartiles(values: list[float], digits: int) -> list[float]:
-        return [round(value, digits) for value in statistics.quantiles(values, n=4, method="inclusive")]
+    def plan(policy: HDPPolicy) -> None:
+        policy.plan(batch).actions.sum().item()  # waits for an accelerator
 
-    return {
-        name: {
-            "ms": quartiles([1000 * elapsed for elapsed in own], 1),
-            "ratio": quartiles([a / b for a, b in zip(own, times[REFERENCE], strict=True)], 3),
-        }
-        for name, own in times.items()
-    }
+    return compare({name: partial(plan, planner) for name, planner in planners.items()}, rounds, REFERENCE)
 
 
 def write_page() -> None:
     """Write the page from the results file."""
-    content = json.loads(RESULTS.read_text())
+    content = json.loads(FILE.read_text())
     run, result = content["run"], content["result"]
     sizes = result["batch_size"]
     lines = [
@@ -119,6 +96,7 @@ def main() -> None:
     options = parser.parse_args()
 
     torch.set_num_threads(options.threads)
+    run = describe_run()
     env = HDPEnv(**ENVS[options.task])
     sizes = {name: getattr(options, name) for name in ("num_layers", "width", "num_inference_steps", "device")}
     planners = {}
@@ -136,7 +114,7 @@ def main() -> None:
         "parameter_ratio": {name: round(n / parameters[REFERENCE], 4) for name, n in parameters.items()},
         "batch_size": {size: measure(planners, size, options.rounds) for size in options.batch_sizes},
     }
-    RESULTS.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+    FILE.write_text(json.dumps({"run": run, "result": result}, indent=2) + "\n")
     write_page()
     print(PAGE.read_text())
 

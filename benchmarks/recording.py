@@ -24,9 +24,9 @@ from tqdm import tqdm
 from dataset_tools.record import EPISODES_PER_SHARD, RecordConfig, RecordDatasetConfig, Shard, record_shard
 from gym_hdp_tasks.env_config import HDPEnv
 
-from .machine import describe_run
+from .machine import RESULTS, describe_run
 
-RESULTS = Path(__file__).parent / "results" / "recording.json"
+FILE = RESULTS / "recording.json"
 TASK = "XArmSorting-v0"
 
 
@@ -92,7 +92,7 @@ def main() -> None:
         shares = time_shares(obs_type, min(num_episodes, EPISODES_PER_SHARD))
         result[obs_type] = time_command(obs_type, num_episodes, options.num_workers) | shares
         print(json.dumps(result[obs_type], indent=2), flush=True)
-    RESULTS.write_text(json.dumps(result, indent=2) + "\n")
+    FILE.write_text(json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":

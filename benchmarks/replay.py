@@ -21,9 +21,9 @@ from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
 from dataset_tools.replay import load_recording, replay
 from gym_hdp_tasks.env_config import TASKS, HDPEnv
 
-from .machine import describe_run
+from .machine import RESULTS, describe_run
 
-RESULTS = Path(__file__).parent / "results" / "replay.json"
+FILE = RESULTS / "replay.json"
 DATASETS = Path("outputs/benchmarks/replay")
 EPISODES_PER_PART = 5
 XARM_TASKS = [task for task in TASKS if task.startswith("XArm")]
@@ -54,14 +54,14 @@ def main() -> None:
     parser.add_argument("--num_episodes", type=int, default=200)
     parser.add_argument("--num_workers", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    results = json.loads(FILE.read_text()) if FILE.exists() else {}
     for task in options.tasks:
         if results.get(task, {}).get("num_episodes") == options.num_episodes:
-            print(f"{task}: kept from {RESULTS.name}")
+            print(f"{task}: kept from {FILE.name}, delete it to measure again")
             continue
         run = describe_run()
         results[task] = {"run": run, **measure(task, options.num_episodes, options.num_workers)}
-        RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+        FILE.write_text(json.dumps(results, indent=2) + "\n")
         print(task, json.dumps(results[task], indent=2))
 
 

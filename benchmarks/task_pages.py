@@ -4,10 +4,11 @@ python -m benchmarks.task_pages
 """
 
 import json
-from pathlib import Path
 
-FOLDER = Path(__file__).parents[1] / "docs" / "tasks"
-RESULTS = Path(__file__).parent / "results"
+from .machine import RESULTS
+from .pages import DOCS
+
+FOLDER = DOCS / "tasks"
 PAGES = {
     "xarm_sorting.md": ["XArmSorting"],
     "xarm_arrange_blocks.md": ["XArmArrangeBlocks"],
@@ -28,7 +29,8 @@ def expert_table(task: str) -> str:
     replay = load("replay").get(f"{task}-v0")
     counts = own["plans"].values()
     rows = {
-        "successes": f'{successes(own)}; with `robot="menagerie"` {successes(menagerie)}',
+        "successes": f'{successes(own)}; with `robot="menagerie"` {successes(menagerie)} '
+        f"(commit {menagerie['run']['git_commit']})",
         "clipped actions": own["clipped_actions"],
         "plans": f"{len(counts)} different ones, each chosen {min(counts)} to {max(counts)} times "
         f"([counts](../../benchmarks/results/expert_{task}.json))",
@@ -95,7 +97,7 @@ def recording_table() -> str:
         )
     workers = results["state"]["num_workers"]
     lines += ["", f"{workers} workers, start-up included; the shares are those of one worker."]
-    lines += ["", "`python -m benchmarks.recording`", ""]
+    lines += ["", f"`{results['run']['command']}`", ""]
     return "\n" + machine(results) + "\n".join(lines)
 
 

@@ -15,8 +15,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,7 @@ from lerobot_hdp.in_memory_dataset import InMemoryDataset
 
 from .machine import RESULTS, describe_run
 from .pages import DOCS
+from .timing import quartiles, quartiles_of_ratio, take_turns
 
 FILE = RESULTS / "training_speed.json"
 PAGE = DOCS / "training_speed.md"
@@ -57,26 +57,6 @@ host prepares what comes next.
 """
 
 
-def timed(function: Callable[[], Any]) -> float:
-    """Seconds that a call takes."""
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
-
-
-def take_turns(functions: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
-    """Seconds that each function takes in each round, called in a random order."""
-    times: dict[str, list[float]] = {name: [] for name in functions}
-    for _ in range(rounds):
-        for name in random.sample(list(functions), len(functions)):
-            times[name].append(timed(functions[name]))
-    return times
-
-
-def quartiles(values: list[float]) -> list[float]:
-    return [float(f"{value:.4g}") for value in statistics.quantiles(values, n=4, method="inclusive")]
-
-
 def endless(dataset: LeRobotDataset, batch_size: int, horizon: int) -> Iterator[dict]:
     """Batches as LeRobot's training draws them, without workers."""
     episodes = dataset.meta.episodes
@@ -91,7 +71,6 @@ def endless(dataset: LeRobotDataset, batch_size: int, horizon: int) -> Iterator[
 def data_path(dataset: LeRobotDataset, batch_size: int, horizon: int, rounds: int) -> dict[str, Any]:
     """Samples per second that each way reads, on one core."""
     item_by_item, at_once = (endless(source, batch_size, horizon) for source in (dataset, InMemoryDataset(dataset)))
-    next(item_by_item), next(at_once)
     batches = 50
     times = take_turns(
         {"one": lambda: next(item_by_item), "many": lambda: [next(at_once) for _ in range(batches)]}, rounds
@@ -100,7 +79,7 @@ def data_path(dataset: LeRobotDataset, batch_size: int, horizon: int, rounds: in
     return {
         "samples_per_s_lerobot": quartiles([batch_size / seconds for seconds in slow]),
         "samples_per_s_in_memory": quartiles([batch_size / seconds for seconds in fast]),
-        "ratio": quartiles([a / b for a, b in zip(slow, fast, strict=True)]),
+        "ratio": quartiles_of_ratio(slow, fast),
     }
 
 
@@ -130,12 +109,11 @@ def step_overhead(dataset: LeRobotDataset, config: PreTrainedConfig, batch_size:
         optimizer.zero_grad()
 
     policy.train()
-    bare(), whole()
     times = take_turns({"bare": bare, "whole": whole}, rounds)
     return {
         "bare_s": quartiles(times["bare"]),
         "whole_s": quartiles(times["whole"]),
-        "ratio": quartiles([a / b for a, b in zip(times["whole"], times["bare"], strict=True)]),
+        "ratio": quartiles_of_ratio(times["whole"], times["bare"]),
     }
 
 
@@ -220,10 +198,11 @@ def main() -> None:
     ]
     result = {name: value for name, value in vars(options).items() if name != "root"} | {"dataset": options.root.name}
     torch.set_num_threads(1)
+    run = describe_run()
     result["data_path"] = data_path(dataset, options.batch_size, options.horizon, options.rounds)
     result["step"] = step_overhead(dataset, config, options.batch_size, options.rounds)
     result["end_to_end"] = end_to_end(flags, options.steps, options.command_rounds)
-    FILE.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+    FILE.write_text(json.dumps({"run": run, "result": result}, indent=2) + "\n")
     write_page()
     print(PAGE.read_text())
 

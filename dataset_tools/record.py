@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import count
 from pathlib import Path
@@ -23,7 +24,6 @@ from typing import Any, NamedTuple
 import av
 import datasets
 import gymnasium as gym
-import mujoco
 import numpy as np
 from draccus.utils import ParsingError
 from lerobot.configs import parser
@@ -224,7 +224,10 @@ def record_episodes(config: RecordConfig, episodes: range) -> Iterator[tuple[Epi
 
 
 def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = None) -> None:
-    """Record a shard, or what is missing of it. What is finished stays, whatever interrupts."""
+    """Record a shard, or what is missing of it.
+
+    SIGTERM and Ctrl-C leave what is finished; after SIGKILL, the shard begins again.
+    """
     if is_complete(shard):
         return
     datasets.disable_progress_bars()  # one for every episode otherwise
@@ -257,13 +260,14 @@ def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = Non
     try:
         for index, (episode, attempts) in enumerate(record_episodes(config, range(start, shard.stop)), start):
             writing = True
-            for frame in range(len(episode.columns[ACTION])):
-                row = {key: column[frame] for key, column in episode.columns.items()}
-                dataset.add_frame({**row, "task": task.instruction})
-            dataset.save_episode()
-            if attempts:
-                failed[index] = attempts
-            writing = False
+            with deferred_signals():
+                for frame in range(len(episode.columns[ACTION])):
+                    row = {key: column[frame] for key, column in episode.columns.items()}
+                    dataset.add_frame({**row, "task": task.instruction})
+                dataset.save_episode()
+                if attempts:
+                    failed[index] = attempts
+                writing = False
             if progress is not None:
                 progress.update()
     finally:
@@ -351,6 +355,8 @@ def try_environment(config: RecordConfig) -> None:
     Raises:
         ValueError: they cannot.
     """
+    import mujoco  # after gym_hdp_tasks, which says how to render without a display
+
     env = gym.make(config.env.gym_id, disable_env_checker=True, **config.env.gym_kwargs)
     try:
         env.reset(seed=0)
@@ -363,6 +369,25 @@ def try_environment(config: RecordConfig) -> None:
 def exit_when_terminated() -> None:
     """Leave by an exception on SIGTERM, so that what is finished is kept."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("hdp-record: terminated; go on with --resume=true"))
+
+
+@contextmanager
+def deferred_signals() -> Iterator[None]:
+    """Let SIGTERM and Ctrl-C wait for the end of a block. Only the main thread is ever interrupted."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    arrived: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in handlers:
+        signal.signal(number, lambda number, _: arrived.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in arrived:
+            signal.raise_signal(number)
 
 
 def when_parent_ends(action: Callable[[], None]) -> None:
@@ -474,7 +499,7 @@ def main() -> None:
         _main()
     except KeyboardInterrupt:
         sys.exit("hdp-record: interrupted; go on with --resume=true")
-    except (ParsingError, ValueError, FileExistsError, ImportError) as error:
+    except (ParsingError, ValueError, OSError, ImportError) as error:
         sys.exit(f"hdp-record: {error}")
 
 

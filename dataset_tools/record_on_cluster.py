@@ -8,7 +8,7 @@ Takes all flags of `hdp-record`; the dataset that comes out is the same. A shard
 own, so that it does not matter which machine records it. When all are done, one more task merges them with LeRobot's
 `aggregate_datasets`. When a job has failed or was stopped, the same command goes on with it. The dataset's folder
 must be one that all machines see; the engine's logs are written beside it. Needs the extra `cluster`:
-`pip install 'lerobot_policy_hdp[cluster]'`.
+`pip install '.[cluster]'` in a clone.
 """
 
 import os
@@ -106,7 +106,7 @@ def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
         _main()
-    except (ParsingError, ValueError, FileExistsError) as error:
+    except (ParsingError, ValueError, OSError, ImportError) as error:
         sys.exit(f"record_on_cluster: {error}")
 
 

@@ -21,7 +21,7 @@ BLOCK_HALF_SIZE = 0.02
 START_OFFSET = 0.035
 """A block starts at most this far from its slot's centre, along x and along y."""
 GRASP_RADIUS = 0.025
-"""Closing the gripper takes the nearest block whose centre is at most this far away."""
+"""A closed gripper that holds nothing takes the nearest block whose centre is at most this far away."""
 HOME = np.array([0.0, -0.12])
 """Where the gripper starts, give or take HOME_OFFSET along x and along y."""
 HOME_OFFSET = 0.02

@@ -77,9 +77,7 @@ def _menagerie_spec() -> mujoco.MjSpec:
     try:
         import mujoco_menagerie
     except ImportError as error:
-        raise ImportError(
-            "robot='menagerie' needs mujoco-menagerie: pip install 'lerobot_policy_hdp[menagerie]'"
-        ) from error
+        raise ImportError("robot='menagerie' needs mujoco-menagerie, this package's extra `menagerie`") from error
     spec = mujoco_menagerie.get("ufactory_xarm7").spec("xarm7")
     spec.body("link_base").pos = (0, 0, 0)
     for name, armature in zip(ARM_JOINTS, _ARMATURE, strict=True):

@@ -94,6 +94,7 @@ class XArmSortingEnv(XArmEnv):
             order = list(options["order"])
             if sorted(order) != sorted_order:
                 raise ValueError(f"order must be a permutation of 0..{n_blocks - 1}, got {order}")
+            order = [int(block) for block in order]
         offsets = self.np_random.uniform(-START_OFFSET, START_OFFSET, size=(n_blocks, 2))
         for slot, block in enumerate(order):
             self.set_object_pose(BLOCKS[block], (*(SLOT_CENTRES[slot] + offsets[slot]), BLOCK_HALF_SIZE))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Generator, Tensor
 
-from .processes import GaussianProcess, MaskedProcess
+from .processes import Corrupted, GaussianProcess, MaskedProcess
 from .sampling import Denoise
 
 MOTION_LEVELS = (0.25, 0.5, 0.75)
@@ -42,7 +42,9 @@ def score_plans(
     """
     generator = Generator(motion.device).manual_seed(NOISE_SEED)
     one = torch.ones(len(motion), device=motion.device)
-    symbols = symbol_process.corrupt(tokens, one) if symbol_process and tokens is not None else None
+    symbols = None
+    if symbol_process and tokens is not None:
+        symbols = Corrupted(symbol_process.prior(tuple(tokens.shape), tokens.device), tokens, one)
     hidden = symbols.value if symbols else None
 
     loss = torch.zeros_like(one)

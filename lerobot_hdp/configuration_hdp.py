@@ -1,5 +1,6 @@
 """Everything that can be set about the planner."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -11,6 +12,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
 
 from .encoders import object_sizes
 from .optimizer import FusedAdamWConfig
+from .processes.gaussian import PREDICTION_TYPES
 from .processes.masked import MASK_SCHEDULES
 from .prompt import encode_prompt
 from .vocabulary import Vocabulary
@@ -62,11 +64,12 @@ class HDPConfig(PreTrainedConfig):
 
     Attributes:
         preset: `default` (measures best) or `paper` (the paper's values). It fills the fields below that are None;
-            what is set explicitly stays.
+            what is set explicitly stays. A checkpoint has all of them set: there it changes nothing.
 
         horizon: number of actions in a plan (H_c): the length of the dataset's episodes.
         symbolic_horizon: number of tokens in a plan (H_d). None: that of the dataset. Longer: filled with PAD.
-        n_action_steps: actions that are executed before the next plan is made. None: the whole plan, open loop.
+        n_action_steps: actions that are executed before the next plan is made, with `plan_from=any_frame`. None: the
+            whole plan, open loop.
         plan_from: `episode_start` trains on the whole plan at the first frame of each episode, which must all be
             `horizon` frames long; `any_frame` on what remains of the plan at any frame, held at its end.
         vocabulary: the symbols, PAD first; read from the dataset.
@@ -113,6 +116,9 @@ class HDPConfig(PreTrainedConfig):
     """How symbols are corrupted: `masked` tokens, `gaussian` noise on one-hot vectors, None: there are none."""
     shared_level: ClassVar[bool] = False
     """Whether motion and symbols are always corrupted equally strongly (k_d = k_c), or independently."""
+
+    planned_modalities: ClassVar[tuple[str, ...]] = ("ACTION",)
+    """Kinds of features that are denoised, and so must be normalised to [-1, 1]."""
 
     preset: str = "default"
 
@@ -174,12 +180,18 @@ class HDPConfig(PreTrainedConfig):
         if self.num_inference_steps is None:
             self.num_inference_steps = self.num_train_timesteps
         _check_choice("plan_from", self.plan_from, ["episode_start", "any_frame"])
-        _check_choice("prediction_type", self.prediction_type, ["epsilon", "sample", "v_prediction"])
+        _check_choice("prediction_type", self.prediction_type, PREDICTION_TYPES)
         _check_choice("sampler", self.sampler, SAMPLERS)
         _check_choice("mask_schedule", self.mask_schedule, MASK_SCHEDULES)
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
+        for name in ("num_layers", "num_heads", "width", "num_train_timesteps"):
+            if getattr(self, name) < 1:
+                raise ParsingError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("dropout", "confidence_threshold"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ParsingError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if self.width % self.num_heads or self.width % 2:
             raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
         if self.rotary and self.width // self.num_heads % 2:
@@ -193,8 +205,17 @@ class HDPConfig(PreTrainedConfig):
                 raise ParsingError(f"{name} must be at least 1, got {value}")
         if self.state_encoder_hidden_dim < 0:
             raise ParsingError(f"state_encoder_hidden_dim must be at least 0, got {self.state_encoder_hidden_dim}")
-        if self.horizon and self.n_action_steps and self.n_action_steps > self.horizon:
-            raise ParsingError(f"n_action_steps={self.n_action_steps} is more than the plan has ({self.horizon=})")
+        if self.horizon and self.n_action_steps and self.n_action_steps != self.horizon:
+            if self.n_action_steps > self.horizon:
+                raise ParsingError(f"n_action_steps={self.n_action_steps} is more than the plan has ({self.horizon=})")
+            if self.plan_from == "episode_start":
+                raise ParsingError(
+                    f"n_action_steps={self.n_action_steps} of {self.horizon} plans again in the middle of an episode, "
+                    "which a planner of whole episodes has not seen: train with plan_from=any_frame, or leave it out"
+                )
+        for modality in self.planned_modalities:
+            if self.normalization_mapping.get(modality) is not NormalizationMode.MIN_MAX:
+                raise ParsingError(f"what is planned lies in [-1, 1]: normalization_mapping needs {modality}: MIN_MAX")
         if self.num_inference_steps > self.num_train_timesteps:
             raise ParsingError(
                 f"num_inference_steps={self.num_inference_steps} is more than {self.num_train_timesteps=}"
@@ -212,6 +233,9 @@ class HDPConfig(PreTrainedConfig):
             ValueError: the dataset has no symbolic plans, they do not fit, or they speak another vocabulary.
         """
         self.input_features.pop(OBS_SYMBOLIC_PLAN, None)  # token ids are no numbers to normalise
+        for key in self.image_features:
+            logging.warning("%s is left out: the planner takes no images yet", key)
+            del self.input_features[key]
         if self.observation_token_sizes is None:
             self.observation_token_sizes = self._token_sizes(features)
         if self.symbol_process is not None:
@@ -252,10 +276,6 @@ class HDPConfig(PreTrainedConfig):
             )
 
     def validate_features(self) -> None:
-        if self.image_features:
-            raise ValueError(
-                f"the planner takes no images yet; leave out {list(self.image_features)} with --policy.input_features"
-            )
         if not self.input_features:
             raise ValueError("the planner needs at least one of observation.state and observation.environment_state")
         if self.action_feature is None:

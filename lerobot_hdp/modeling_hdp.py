@@ -1,5 +1,6 @@
 """The planner as a LeRobot policy."""
 
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -13,6 +14,7 @@ from lerobot.utils.constants import ACTION
 from safetensors import SafetensorError
 from torch import Generator, Tensor, nn
 
+from . import processor_hdp  # noqa: F401 (a checkpoint's processors can be loaded wherever the policy can)
 from .candidates import PARTIAL_MOTION_CANDIDATES, best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
@@ -124,12 +126,23 @@ class HDPPolicy(PreTrainedPolicy):
             The loss, and its two parts for logging.
         """
         if not self.training:
+            self._warn_of_partial_plans(batch)
             return self._loss(batch, self._planning_network, None)
         step = self._next_step()
         generator = Generator(self._device).manual_seed(_seed(*step))
         with torch.random.fork_rng(devices=self._cuda_devices):
             torch.manual_seed(_seed(*step, 1 + _rank_and_world_size()[0]))  # of dropout
             return self._loss(batch, self.planner, generator)
+
+    def _warn_of_partial_plans(self, batch: dict[str, Tensor]) -> None:
+        """LeRobot evaluates the loss at every frame of the held-out episodes; `hdp-train`, where plans begin."""
+        is_pad = batch.get(f"{ACTION}_is_pad")
+        if self.config.plan_from == "episode_start" and is_pad is not None and is_pad.any():
+            warnings.warn(
+                "eval_loss says nothing of this planner: it is trained on whole plans, and evaluated in the middle of "
+                "episodes. Train with hdp-train, or with --policy.plan_from=any_frame.",
+                stacklevel=2,
+            )
 
     def _next_step(self) -> tuple[int, int]:
         """Count a training step: `noise_seed` and `forward_calls`.
@@ -201,7 +214,7 @@ class HDPPolicy(PreTrainedPolicy):
             batch: preprocessed observations.
             prompt: the part of the plan that is given, see `read_prompt`. Each candidate draws places of its own for
                 words that say none.
-            generator: source of all randomness; None: PyTorch's global one.
+            generator: source of all randomness, on the policy's device; None: PyTorch's global one.
             on_step: sees the half-done plan after each step, and all candidates of it: those of one observation follow
                 each other.
             num_candidates: k plans are drawn for each observation, and the one that the model itself finds most
@@ -357,6 +370,7 @@ class HDPPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
         """The next action of the plan, after making one if there is none: (B, D)."""
+        self.eval()
         if not self._queue:
             self._queue.extend(self.predict_action_chunk(batch).unbind(dim=1))
         return self._queue.popleft()

@@ -32,6 +32,12 @@ class MovingAverage(nn.Module):
         self.register_buffer("n_averaged", torch.tensor(0))
         self._updates: int | None = None  # read when first needed: a distributed run sends the buffers around first
 
+    def train(self, mode: bool = True) -> "MovingAverage":
+        """The averaged network only plans: it has no dropout, whatever the policy that holds it does."""
+        super().train(mode)
+        self.module.eval()
+        return self
+
     @torch.no_grad()
     def update(self, network: nn.Module) -> None:
         """Move towards the network's parameters."""

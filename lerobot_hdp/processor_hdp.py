@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import (
     ObservationProcessorStep,
@@ -16,7 +15,7 @@ from lerobot.processor.factory import make_default_policy_processor_steps, make_
 from torch import Tensor
 
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
-from .vocabulary import FREE_SYMBOL
+from .vocabulary import FREE, FREE_SYMBOL, PAD_ID
 
 
 @ProcessorStepRegistry.register(name="hdp_symbolic_plan")
@@ -24,8 +23,8 @@ from .vocabulary import FREE_SYMBOL
 class SymbolicPlanProcessorStep(ObservationProcessorStep):
     """Make `observation.symbolic_plan` what the planner expects: (B, symbolic_horizon) int64 token ids.
 
-    Plans from a dataset are filled with PAD up to the planner's horizon; prompts from an environment may hold FREE
-    (-1). A planner without symbols never sees the column.
+    Plans from a dataset are filled with PAD up to the planner's horizon. Prompts from an environment may hold FREE
+    (-1), and one that ends with it is filled with it. A planner without symbols never sees the column.
 
     Attributes:
         symbolic_horizon: H_d; None: the planner models no symbols.
@@ -54,7 +53,9 @@ class SymbolicPlanProcessorStep(ObservationProcessorStep):
                 f"{OBS_SYMBOLIC_PLAN} holds the token id {plan[unknown][0].item()}, which is none of the "
                 f"{self.vocabulary_size} symbols"
             )
-        observation[OBS_SYMBOLIC_PLAN] = F.pad(plan, (0, self.symbolic_horizon - plan.shape[1]))
+        # What follows a whole plan is PAD; what follows a prompt that leaves its last token open is open, too.
+        filling = torch.where(plan[:, -1:] < PAD_ID, FREE, PAD_ID).expand(-1, self.symbolic_horizon - plan.shape[1])
+        observation[OBS_SYMBOLIC_PLAN] = torch.cat([plan, filling], dim=1)
         return observation
 
     def get_config(self) -> dict[str, Any]:

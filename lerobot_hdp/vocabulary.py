@@ -18,8 +18,8 @@ class Vocabulary:
     """Symbols in words <-> token ids.
 
     The id of a symbol is its position; symbol 0 fills the end of a plan that is shorter than the symbolic horizon.
-    The mask of the masked process has the id `mask_id = len(vocabulary)`. It is no symbol: it is neither read nor
-    printed, and no plan holds it.
+    The mask of the masked process, with the id `len(vocabulary)`, is no symbol: it is neither read nor printed, and no
+    plan holds it.
 
     Example:
         >>> vocabulary = Vocabulary(["PAD", "A", "B", "PICK"])
@@ -41,10 +41,6 @@ class Vocabulary:
         self._ids = {symbol.upper(): i for i, symbol in enumerate(self.symbols)}
 
     def __len__(self) -> int:
-        return len(self.symbols)
-
-    @property
-    def mask_id(self) -> int:
         return len(self.symbols)
 
     def __contains__(self, word: str) -> bool:

@@ -7,6 +7,7 @@ import shutil
 import pytest
 
 import benchmarks
+from benchmarks import task_pages
 from benchmarks.paper.presets import METHODS, make_cells
 from benchmarks.planner_comparison import PRESETS, TASKS
 
@@ -29,6 +30,15 @@ def test_a_page_is_what_the_committed_results_make(name, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "PAGE", written)
     module.write_page()
     assert written.read_text() == committed.read_text()
+
+
+def test_the_tasks_pages_are_what_the_committed_results_make(tmp_path, monkeypatch):
+    committed = task_pages.FOLDER
+    shutil.copytree(committed, tmp_path / "tasks")
+    monkeypatch.setattr(task_pages, "FOLDER", tmp_path / "tasks")
+    task_pages.main()
+    for name in (*task_pages.PAGES, "xarm.md"):
+        assert (tmp_path / "tasks" / name).read_text() == (committed / name).read_text()
 
 
 def test_the_comparison_of_planners_is_what_the_committed_results_make(tmp_path, monkeypatch):

@@ -254,6 +254,17 @@ def test_a_run_that_is_out_of_time_leaves_a_checkpoint_and_goes_on_from_it(datas
     assert_same_weights(weights(run), weights(lerobot_train_run[1]))
 
 
+def test_the_held_out_loss_is_that_of_whole_plans(dataset_root, tmp_path):
+    flags = (*PLANNER_FLAGS, f"--eval_steps={STEPS}", "--dataset.eval_split=0.2")
+    by_lerobot, in_memory = (
+        train(command, dataset_root, tmp_path / command, flags) for command in ("lerobot-train", "hdp-train")
+    )
+    assert len(losses(by_lerobot)) == len(losses(in_memory)) == STEPS + 1
+    assert losses(in_memory)[:STEPS] == losses(by_lerobot)[:STEPS]
+    assert "eval_loss says nothing of this planner" in by_lerobot.stderr
+    assert "eval_loss says nothing of this planner" not in in_memory.stderr
+
+
 def test_a_job_elsewhere_is_refused():
     flags = ("--dataset.repo_id=test/dataset", *PLANNER_FLAGS, "--job.target=l4x1")
     result = run_command("hdp-train", *flags, check=False)

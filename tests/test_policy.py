@@ -3,7 +3,9 @@
 import pytest
 import torch
 from draccus.utils import ParsingError
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies import make_policy
+from torch.utils.data import default_collate
 
 from lerobot_hdp import FREE, HDPConfig, PlanPrompt
 from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
@@ -110,7 +112,7 @@ def test_given_symbols_stay_fixed_in_every_step(make_planner, batch):
     given = token_ids >= 0
     assert len(states) == 11
     assert all(torch.equal(state.tokens[given], token_ids[given]) for state in states)
-    assert (states[0].tokens[~given] == policy.vocabulary.mask_id).all()
+    assert (states[0].tokens[~given] == policy.symbol_process.mask_id).all()
     assert (plan.token_probabilities[given] == 1).all()
 
 
@@ -151,7 +153,7 @@ def test_a_prompt_from_the_environment_is_followed(make_planner, batch):
 
 
 def test_a_smaller_n_action_steps_replans(make_planner, batch):
-    policy, preprocessor, _ = make_planner(n_action_steps=5)
+    policy, preprocessor, _ = make_planner(n_action_steps=5, plan_from="any_frame")
     inputs = observation(preprocessor(batch))
     assert policy.eval().predict_action_chunk(inputs).shape == (4, 5, 3)
     calls = []
@@ -162,11 +164,44 @@ def test_a_smaller_n_action_steps_replans(make_planner, batch):
 
 
 def test_any_frame_trains_on_what_remains(make_planner, dataset):
-    policy, *_ = make_planner(plan_from="any_frame")
+    policy, preprocessor, _ = make_planner(plan_from="any_frame")
     assert policy.config.drop_n_last_frames == 0
     item = dataset[7]
     assert torch.equal(item["action"][-7:], item["action"][-1].expand(7, -1))
     assert len(policy.vocabulary.decode(item["observation.symbolic_plan"])) == 12
+    remaining = preprocessor(default_collate([dataset[frame] for frame in (0, 7, HORIZON - 1)]))
+    history = train_in_process(policy, remaining, steps=60)
+    for name in ("motion_loss", "symbol_loss"):
+        assert sum(parts[name] for parts in history[-10:]) < 0.7 * sum(parts[name] for parts in history[:10])
+
+
+def test_cameras_are_left_out(dataset, caplog):
+    camera = {"dtype": "video", "shape": (32, 48, 3), "names": ["height", "width", "channels"], "info": None}
+    config = HDPConfig(**TINY_PLANNER, device="cpu")
+    config.input_features = {
+        "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 32, 48)),
+        "observation.state": PolicyFeature(FeatureType.STATE, (3,)),
+    }
+    config.set_dataset_feature_metadata({**dataset.meta.features, "observation.images.front": camera})
+    assert list(config.input_features) == ["observation.state"]
+    assert config.observation_token_sizes == [3]
+    assert "observation.images.front is left out" in caplog.text
+
+
+def test_an_open_prompt_stays_open_where_it_is_filled(make_planner, batch):
+    """An environment may know a shorter plan than the planner makes."""
+    policy, preprocessor, _ = make_planner(symbolic_horizon=24)
+    prompt = torch.full((4, 18), FREE)
+    prompt[:, 0] = 3  # PICK
+    inputs = preprocessor(observation(batch) | {OBS_SYMBOLIC_PLAN: prompt})
+    assert (inputs[OBS_SYMBOLIC_PLAN][:, 1:] == FREE).all()
+    assert not policy.read_prompt(inputs).not_pad[:, 1:].any()
+
+
+def test_planning_has_no_dropout_even_while_the_policy_trains(make_planner, inputs):
+    policy, *_ = make_planner(dropout=0.5)
+    plans = [policy.train().plan(observation(inputs), generator=torch.Generator().manual_seed(0)) for _ in range(2)]
+    assert torch.equal(plans[0].actions, plans[1].actions)
 
 
 def test_planning_uses_the_moving_average_of_the_weights(make_planner, batch):
@@ -227,8 +262,8 @@ def test_rotary_attention_is_plain_attention_that_knows_distances():
 
 
 @pytest.mark.parametrize("policy_type", ["hdp", "joint_diffuser"])
-def test_rotary_embedding_can_be_switched_on(make_planner, batch, policy_type):
-    policy, preprocessor, _ = make_planner(policy_type, rotary=True)
+def test_rotary_embedding_can_be_switched_off(make_planner, batch, policy_type):
+    policy, preprocessor, _ = make_planner(policy_type, rotary=False)
     losses = [parts["motion_loss"] for parts in train_in_process(policy, preprocessor(batch), steps=60)]
     assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
     plan = policy.eval().plan(observation(preprocessor(batch)))
@@ -262,7 +297,7 @@ class TestPaperPreset:
         assert HDPConfig(preset="paper", dropout=0.1, device="cpu").dropout == 0.1
 
     def test_plans_are_filled_with_pad(self, make_planner, batch):
-        policy, preprocessor, _ = make_planner(symbolic_horizon=108)
+        policy, preprocessor, _ = make_planner(preset="paper", symbolic_horizon=108)
         tokens = preprocessor(batch)["observation.symbolic_plan"]
         assert tokens.shape == (4, 108)
         assert (tokens[:, 18:] == 0).all()
@@ -338,6 +373,12 @@ class TestBadInput:
             {"width": 30, "num_heads": 4},
             {"horizon": 0},
             {"horizon": 10, "n_action_steps": 11},
+            {"n_action_steps": 5, "horizon": 10},  # with plan_from=episode_start
+            {"num_layers": 0},
+            {"num_heads": 0},
+            {"dropout": 1.5},
+            {"confidence_threshold": -1.0},
+            {"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}},
             {"num_inference_steps": 101},
             {"num_candidates": 0},
             {"state_encoder_hidden_dim": -1},

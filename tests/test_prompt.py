@@ -169,7 +169,7 @@ class TestThroughThePolicy:
         policy, *_ = make_planner()
         states = []
         policy.eval().plan(inputs, "... AUX ...", num_candidates=8, on_step=lambda _, state: states.append(state))
-        given = states[0].tokens.unflatten(0, (4, 8)) != policy.vocabulary.mask_id
+        given = states[0].tokens.unflatten(0, (4, 8)) != policy.symbol_process.mask_id
         assert (given.sum(dim=2) == 1).all()
         assert all(len(set(sample.long().argmax(dim=1).tolist())) > 1 for sample in given)
 

@@ -5,11 +5,13 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
+from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from dataset_tools.experts import EXPERTS
@@ -143,6 +145,26 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_pa
     assert not (tmp_path / "stopped.partial").exists()
 
 
+def test_ctrl_c_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch):
+    config = RecordConfig(
+        dataset=RecordDatasetConfig(repo_id="test/stopped", root=tmp_path / "stopped", num_episodes=5),
+        env=HDPEnv(n_blocks=2, waypoints_per_pose=1),
+    )
+    save_episode = LeRobotDataset.save_episode
+
+    def save_while_ctrl_c_is_pressed(dataset):
+        if dataset.meta.total_episodes == 2:
+            signal.raise_signal(signal.SIGINT)
+        save_episode(dataset)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LeRobotDataset, "save_episode", save_while_ctrl_c_is_pressed)
+        with pytest.raises(KeyboardInterrupt):
+            record(config)
+    assert load_info(tmp_path / "stopped.partial/episodes_000000").total_episodes == 3
+    assert record(replace(config, resume=True)).num_episodes == 5
+
+
 def test_failed_demonstrations_are_dropped_and_counted(tmp_path, monkeypatch, capsys):
     """An expert that now and then forgets to open the gripper at the end."""
     expert = EXPERTS["hdp/BlockSorting2D-v0"]
@@ -172,6 +194,7 @@ def test_failed_demonstrations_are_dropped_and_counted(tmp_path, monkeypatch, ca
         (("--env.task=Juggling-v0",), "is not a task of --env.type=hdp"),
         (("--env.n_blocks=1",), "n_blocks must be in [2, 8]"),
         (("--dataset.num_episodes=0",), "must be at least 1"),
+        (("--dataset.root=/dev/null/dataset",), "Not a directory"),
     ],
 )
 def test_bad_flags_are_one_line_and_leave_nothing_behind(tmp_path, flags, message):

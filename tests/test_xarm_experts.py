@@ -93,6 +93,5 @@ def test_blocks_can_always_be_arranged():
     rng = np.random.default_rng(0)
     env = gym.make("hdp/XArmArrangeBlocks-v0", disable_env_checker=True).unwrapped
     for _ in range(300):
-        # Crowded: all three near slots.
         env.reset(seed=int(rng.integers(2**31)))
         assert possible_moves(env.object_poses()[:, :2])

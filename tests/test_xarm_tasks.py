@@ -68,6 +68,8 @@ def test_sorting_takes_the_order_that_it_is_given():
     env = gym.make("hdp/XArmSorting-v0", disable_env_checker=True).unwrapped
     env.reset(seed=0, options={"order": [0, 1, 2]})
     assert env.score() == 1.0
+    env.reset(seed=0, options={"order": np.array([0.0, 1.0, 2.0])})
+    assert env.score() == 1.0
     with pytest.raises(ValueError, match="permutation"):
         env.reset(options={"order": [0, 0, 1]})
 

@@ -32,6 +32,8 @@ class HierarchicalDiffuserConfig(HDPConfig):
     coupled: ClassVar[bool] = False
     """Whether both levels are denoised together."""
 
+    planned_modalities = ("ACTION", "STATE", "ENV")
+
     subgoal_interval: int | None = None
 
     def __post_init__(self):

@@ -150,6 +150,8 @@ def make_plan(config: PlanConfig) -> Result:
     policy, preprocessor, postprocessor = _load(config)
     if config.check and policy.config.num_candidates == 1:
         raise ValueError("--check=true chooses among candidates: set --policy.num_candidates to more than 1")
+    if config.check and policy.vocabulary is None:
+        raise ValueError("--check=true: this planner models no symbols, so there is no plan to check")
     env_preprocessor, _ = make_env_pre_post_processors(config.env, config.policy)
     task = getattr(config.env, "planning_task", None)
     if task is not None:

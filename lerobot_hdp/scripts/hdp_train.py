@@ -16,12 +16,15 @@ import sys
 import time
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_train
 from lerobot.utils.collate import lerobot_collate_fn
+from torch.utils.data import Dataset, Subset
 
+from lerobot_hdp.configuration_hdp import HDPConfig
 from lerobot_hdp.in_memory_dataset import Batch, InMemoryDataset, memory_needed, unsupported
 
 GIB = 2**30
@@ -55,6 +58,20 @@ def hold_datasets_in_memory(max_gib: float) -> None:
     lerobot_train.make_train_eval_datasets = make_datasets_in_memory
     lerobot_train.save_checkpoint = save_with_users_num_workers
     lerobot_train.lerobot_collate_fn = collate_unless_collated
+
+
+def evaluate_where_plans_begin() -> None:
+    """Let `lerobot-train` take the held-out loss of planners of whole episodes at the first frames of these alone."""
+    make_datasets = lerobot_train.make_train_eval_datasets
+
+    def make_datasets_of_first_frames(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, Dataset | None]:
+        train, held_out = make_datasets(cfg)
+        if held_out is None or not isinstance(cfg.policy, HDPConfig) or cfg.policy.plan_from != "episode_start":
+            return train, held_out
+        frames = np.flatnonzero(held_out.hf_dataset.with_format("numpy")["frame_index"][:] == 0)
+        return train, Subset(held_out, frames[: cfg.max_eval_samples or None].tolist())
+
+    lerobot_train.make_train_eval_datasets = make_datasets_of_first_frames
 
 
 def _why_not_in_memory(datasets: list[LeRobotDataset], max_gib: float) -> str | None:
@@ -144,6 +161,7 @@ def main() -> None:
         parser.print_help()
     lerobot_train.submit_to_hf = refuse_to_submit
     hold_datasets_in_memory(options.max_memory_gib)
+    evaluate_where_plans_begin()
     if options.max_train_minutes is not None:
         stop_after(options.max_train_minutes)
     try:
