@@ -356,7 +356,7 @@ class HDPPolicy(PreTrainedPolicy):
         observation = network.encoder(batch)
 
         def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
-            with torch.autocast(self._device.type, torch.bfloat16, enabled=self.config.dtype == "bfloat16"):
+            with self._autocast():
                 prediction = network.denoiser(motion, symbols, observation, k_c, k_d)
             return Prediction(*(None if part is None else part.float() for part in prediction))
 
@@ -383,6 +383,10 @@ class HDPPolicy(PreTrainedPolicy):
     @property
     def _device(self) -> torch.device:
         return self.noise_seed.device
+
+    def _autocast(self) -> torch.autocast:
+        """For planning; in training, Accelerate does the same (`dtype`)."""
+        return torch.autocast(self._device.type, torch.bfloat16, enabled=self.config.dtype == "bfloat16")
 
     @property
     def _cuda_devices(self) -> list[torch.device]:

@@ -156,7 +156,7 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
 
         def sample(denoise: Callable[[Tensor, Tensor], Tensor], shape: tuple[int, int, int], **kwargs) -> Tensor:
             def denoise_alone(value: Tensor, _: None, level: Tensor, __: Tensor) -> Prediction:
-                with torch.autocast(device.type, torch.bfloat16, enabled=config.dtype == "bfloat16"):
+                with self._autocast():
                     return Prediction(denoise(value, level).float(), None)
 
             process, steps = self.motion_process, self.config.num_inference_steps
@@ -249,7 +249,7 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
         if on_step is not None:
             on_step(0, self._show(segments.value))
         for i in range(self.config.num_inference_steps):
-            with torch.autocast(device.type, torch.bfloat16, enabled=config.dtype == "bfloat16"):
+            with self._autocast():
                 high, low = self._denoise_both(network, subgoals.value, segments.value, state, subgoals.level(i))
             subgoals.advance(i, high.float(), generator)
             segments.advance(i, low.float(), generator)
