@@ -150,7 +150,7 @@ class Cell:
         Raises:
             ValueError: it was trained or evaluated otherwise than this cell says.
         """
-        for name in ("demonstrations", "steps", "batch_size", "starts", "average_last", "policy"):
+        for name in ("demonstrations", "steps", "batch_size", "seed", "starts", "average_last", "policy"):
             if result[name] != getattr(self, name):
                 raise ValueError(
                     f"{self.result_file} was made with {name}={result[name]}, not {getattr(self, name)}: delete it, or "

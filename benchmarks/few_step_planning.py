@@ -101,11 +101,8 @@ def main() -> None:
     train_config = TrainPipelineConfig.from_pretrained(options.checkpoint)
     env = train_config.env
     task = env.task.removesuffix("-v0") + (f"_{env.n_blocks}_blocks" if env.task == "BlockSorting2D-v0" else "")
-    curve, run_facts = [], describe_run()
-    for sampler, calls in product(options.samplers, options.calls):
-        curve.append(evaluate(options.checkpoint, env, sampler, calls, options.episodes))
-        print(curve[-1], flush=True)
-    planner = train_config.policy.type
+    planner, run_facts = train_config.policy.type, describe_run()
+    curve: list[dict[str, Any]] = []
     result = {
         "planner": planner,
         "task": task,
@@ -114,7 +111,11 @@ def main() -> None:
         "curve": curve,
     }
     FOLDER.mkdir(parents=True, exist_ok=True)
-    (FOLDER / f"{planner}_{task}.json").write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
+    for sampler, calls in product(options.samplers, options.calls):
+        curve.append(evaluate(options.checkpoint, env, sampler, calls, options.episodes))
+        print(curve[-1], flush=True)
+        file = FOLDER / f"{planner}_{task}.json"
+        file.write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")  # what there is so far
     write_page()
 
 

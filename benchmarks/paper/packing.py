@@ -57,6 +57,7 @@ def pack(cells: Sequence[Cell], folder: Path) -> None:
             _compress(cell.folder, folder)
     mib = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 2**20
     if mib > MAX_MIB:
+        shutil.rmtree(folder)
         raise ValueError(f"{folder} has {mib:.0f} MiB, more than {MAX_MIB}: pack fewer tasks, or no stopped cells")
     print(f"{folder}: {len(cells)} cells, {mib:.1f} MiB")
 
@@ -132,15 +133,18 @@ def export(checkpoint: Path, target: Path, max_file_size: str = "5GB") -> None:
     if policy.ema is not None:
         policy.planner.load_state_dict(policy.ema.module.state_dict())
         policy.ema, policy.config.ema_max_decay = None, 0.0
-    target.mkdir(parents=True)
+    unfinished = target.with_name(f"{target.name}.new")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
     for path in checkpoint.iterdir():
         if path.name != WEIGHTS:
-            shutil.copy(path, target)
-    policy.config.save_pretrained(target)
+            shutil.copy(path, unfinished)
+    policy.config.save_pretrained(unfinished)
     weights = {
         name: value.bfloat16() if value.is_floating_point() else value for name, value in policy.state_dict().items()
     }
-    save_torch_state_dict(weights, target, max_shard_size=max_file_size)
+    save_torch_state_dict(weights, unfinished, max_shard_size=max_file_size)
+    unfinished.rename(target)
 
 
 def join_files(folder: Path) -> None:
