@@ -143,15 +143,21 @@ def test_cameras_that_a_task_cannot_have_are_refused_before_anything_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_lerobot_trains_its_own_diffusion_policy_on_it(dataset, tmp_path):
+DIFFUSION_FLAGS = ("--policy.type=diffusion", "--policy.pretrained_backbone_weights=null")
+DIFFUSION_FLAGS += ("--policy.use_group_norm=true", "--policy.down_dims=[16,32]", "--policy.horizon=16")
+DIFFUSION_FLAGS += ("--policy.n_action_steps=8",)
+PLANNER_FLAGS = ("--policy.type=hdp", "--policy.horizon=145", "--policy.num_layers=1", "--policy.width=32")
+
+
+@pytest.mark.parametrize(
+    ("policy_flags", "says"),
+    [(DIFFUSION_FLAGS, ""), (PLANNER_FLAGS, "observation.images.front is left out")],
+    ids=["diffusion", "hdp"],
+)
+def test_lerobot_trains_its_own_diffusion_policy_on_it_and_the_planner(dataset, tmp_path, policy_flags, says):
     result = run_command(
         "lerobot-train",
-        "--policy.type=diffusion",
-        "--policy.pretrained_backbone_weights=null",
-        "--policy.use_group_norm=true",
-        "--policy.down_dims=[16,32]",
-        "--policy.horizon=16",
-        "--policy.n_action_steps=8",
+        *policy_flags,
         "--policy.push_to_hub=false",
         "--policy.device=cpu",
         "--dataset.repo_id=test/cameras",
@@ -164,4 +170,5 @@ def test_lerobot_trains_its_own_diffusion_policy_on_it(dataset, tmp_path):
         "--num_workers=0",
     )
     assert "step:2" in result.stderr
+    assert says in result.stderr
     assert (tmp_path / "run/checkpoints/last/pretrained_model/model.safetensors").exists()
