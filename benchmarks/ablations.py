@@ -129,7 +129,7 @@ def write_page() -> None:
             rates = [point["success_rate"] for point in content["result"]["curve"][-cell.average_last :]]
             scores[variant, task].append(100 * mean(rates))
     rows = [[f"`{variant}`", *(_each(scores[variant, task]) for task in TASKS)] for variant in VARIANTS]
-    spread = max(max(seeds) - min(seeds) for seeds in list(scores.values()) if seeds)
+    spread = max(max(seeds) - min(seeds) for seeds in scores.values() if seeds)
     bases = [cells[VARIANTS[0], task, SEEDS[0]] for task in TASKS]
     PAGE.write_text(
         "# What helps HDP to learn\n\n"

@@ -24,7 +24,8 @@ from typing import Any
 import torch
 from lerobot.scripts import lerobot_train
 
-from dataset_tools.record import RecordConfig, RecordDatasetConfig, record, when_parent_ends
+from dataset_tools.interruption import when_parent_ends
+from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
 from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.scripts import hdp_train

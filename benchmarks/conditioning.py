@@ -12,9 +12,9 @@ XArmToolUse, in which it says that red is stacked last (the paper's "conditional
 
 import argparse
 import json
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from lerobot_hdp.candidates import best_candidates
 
 from .evaluation import Subject, execute, load, make_plans, rate, wilson_interval
 from .machine import RESULTS, describe_run
+from .timing import timed
 
 CANDIDATES = (1, 2, 4, 8)
 TIMED_STARTS = 20
@@ -139,9 +140,7 @@ def seconds_per_plan(subject: Subject, k: int) -> float:
     seconds = []
     for i in range(TIMED_STARTS):
         inputs = {key: value[i : i + 1] for key, value in subject.inputs.items()}
-        begin = time.perf_counter()
-        subject.policy.plan(inputs, num_candidates=k)
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(timed(partial(subject.policy.plan, inputs, num_candidates=k)))
     return float(np.median(seconds))
 
 

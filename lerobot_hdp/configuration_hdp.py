@@ -23,6 +23,9 @@ keeps only `observation.*` columns."""
 
 SAMPLERS = ["ddpm", "ddim", "confidence"]
 
+AT_LEAST_1 = ["num_layers", "num_heads", "width", "num_train_timesteps", "horizon", "symbolic_horizon"]
+AT_LEAST_1 += ["n_action_steps", "num_inference_steps", "num_candidates"]
+
 PRESETS: dict[str, dict[str, Any]] = {
     # What measures best.
     "default": {
@@ -186,9 +189,10 @@ class HDPConfig(PreTrainedConfig):
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
-        for name in ("num_layers", "num_heads", "width", "num_train_timesteps"):
-            if getattr(self, name) < 1:
-                raise ParsingError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in AT_LEAST_1:
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ParsingError(f"{name} must be at least 1, got {value}")
         for name in ("dropout", "confidence_threshold"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ParsingError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
@@ -199,10 +203,6 @@ class HDPConfig(PreTrainedConfig):
                 f"rotary embedding needs an even width / num_heads, got {self.width} / {self.num_heads}: "
                 "choose another width, or rotary=false"
             )
-        for name in ("horizon", "symbolic_horizon", "n_action_steps", "num_inference_steps", "num_candidates"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ParsingError(f"{name} must be at least 1, got {value}")
         if self.state_encoder_hidden_dim < 0:
             raise ParsingError(f"state_encoder_hidden_dim must be at least 0, got {self.state_encoder_hidden_dim}")
         if self.horizon and self.n_action_steps and self.n_action_steps != self.horizon:

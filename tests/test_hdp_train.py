@@ -23,14 +23,13 @@ from lerobot_hdp import HDPConfig
 from lerobot_hdp.in_memory_dataset import InMemoryDataset, memory_needed, unsupported
 from lerobot_hdp.scripts import hdp_train
 
-from .conftest import TINY_PLANNER, run_command
+from .conftest import DIFFUSION_FLAGS, TINY_PLANNER, run_command
 
 FPS = 10
 STEPS = 6
 TWO_PROCESSES = ("torchrun", "--nproc_per_node=2", Path(sys.executable).with_name("hdp-train"))
 PLANNER_FLAGS = ("--policy.type=hdp", *(f"--policy.{name}={value}" for name, value in TINY_PLANNER.items()))
-DIFFUSION_FLAGS = ("--policy.type=diffusion", "--policy.down_dims=[16,32]", "--policy.crop_shape=[24,24]")
-DIFFUSION_FLAGS += ("--policy.pretrained_backbone_weights=null", "--policy.use_group_norm=true")
+CROPPED_DIFFUSION_FLAGS = (*DIFFUSION_FLAGS, "--policy.crop_shape=[24,24]")
 ACT_FLAGS = ("--policy.type=act", "--policy.dim_model=32", "--policy.dim_feedforward=32", "--policy.n_heads=2")
 ACT_FLAGS += ("--policy.chunk_size=5", "--policy.n_action_steps=5", "--policy.pretrained_backbone_weights=null")
 
@@ -296,7 +295,7 @@ def test_two_processes_that_are_out_of_time_leave_a_checkpoint(dataset_root, tmp
 
 
 @pytest.mark.parametrize("camera_root", ["video"], indirect=True)
-@pytest.mark.parametrize("policy_flags", [DIFFUSION_FLAGS, ACT_FLAGS], ids=["diffusion", "act"])
+@pytest.mark.parametrize("policy_flags", [CROPPED_DIFFUSION_FLAGS, ACT_FLAGS], ids=["diffusion", "act"])
 def test_other_policies_train_with_cameras(camera_root, tmp_path, policy_flags):
     flags = (*policy_flags, "--eval_steps=3", "--dataset.eval_split=0.1")
     by_lerobot, in_memory = (

@@ -20,7 +20,7 @@ from dataset_tools.record import RecordConfig, RecordDatasetConfig, episode_seed
 from dataset_tools.replay import load_recording, replay
 from gym_hdp_tasks.env_config import HDPEnv
 
-from .conftest import run_command
+from .conftest import DIFFUSION_FLAGS, run_command
 
 SORTING = HDPEnv(task="XArmSorting-v0", obs_type="pixels_state", camera_height=32, camera_width=48)
 ARRANGE = HDPEnv(task="XArmArrangeBlocks-v0", obs_type="pixels_state", camera_height=32, camera_width=48)
@@ -143,15 +143,15 @@ def test_cameras_that_a_task_cannot_have_are_refused_before_anything_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-DIFFUSION_FLAGS = ("--policy.type=diffusion", "--policy.pretrained_backbone_weights=null")
-DIFFUSION_FLAGS += ("--policy.use_group_norm=true", "--policy.down_dims=[16,32]", "--policy.horizon=16")
-DIFFUSION_FLAGS += ("--policy.n_action_steps=8",)
 PLANNER_FLAGS = ("--policy.type=hdp", "--policy.horizon=145", "--policy.num_layers=1", "--policy.width=32")
 
 
 @pytest.mark.parametrize(
     ("policy_flags", "says"),
-    [(DIFFUSION_FLAGS, ""), (PLANNER_FLAGS, "observation.images.front is left out")],
+    [
+        ((*DIFFUSION_FLAGS, "--policy.horizon=16", "--policy.n_action_steps=8"), ""),
+        (PLANNER_FLAGS, "observation.images.front is left out"),
+    ],
     ids=["diffusion", "hdp"],
 )
 def test_lerobot_trains_its_own_diffusion_policy_on_it_and_the_planner(dataset, tmp_path, policy_flags, says):
