@@ -137,7 +137,8 @@ class HDPPolicy(PreTrainedPolicy):
     def _warn_of_partial_plans(self, batch: dict[str, Tensor]) -> None:
         """LeRobot evaluates the loss at every frame of the held-out episodes; `hdp-train`, where plans begin."""
         is_pad = batch.get(f"{ACTION}_is_pad")
-        if self.config.plan_from == "episode_start" and is_pad is not None and is_pad.any():
+        # HD's last segment may end after the horizon, and so hold padding in every sample.
+        if self.config.plan_from == "episode_start" and is_pad is not None and is_pad[:, : self.config.horizon].any():
             warnings.warn(
                 "eval_loss says nothing of this planner: it is trained on whole plans, and evaluated in the middle of "
                 "episodes. Train with hdp-train, or with --policy.plan_from=any_frame.",

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+import warnings
 
 import pytest
 import torch
@@ -70,6 +71,19 @@ class HostReads(TorchDispatchMode):
         if waits:
             self.found.append(str(func))
         return func(*args, **kwargs or {})
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_held_out_loss_warns_of_partial_plans_alone(make_planner, training_batch, planner):
+    """HD's and CHD's last segment ends after the horizon, in padding."""
+    policy, preprocessor, _ = make_planner(planner)
+    whole = preprocessor(training_batch(policy))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        policy.eval().forward(whole)
+    partial = {**whole, "action_is_pad": torch.ones_like(whole["action_is_pad"])}
+    with pytest.warns(UserWarning, match="eval_loss says nothing"):
+        policy.forward(partial)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)

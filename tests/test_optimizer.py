@@ -1,5 +1,7 @@
 """Fused AdamW: the same training, through LeRobot's configs and checkpoints."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from lerobot.configs.default import DatasetConfig
@@ -10,7 +12,7 @@ from torch.optim import Optimizer
 from lerobot_hdp import HDPConfig
 from lerobot_hdp.optimizer import FusedAdamWConfig
 
-from .conftest import REPOSITORY, TINY_PLANNER
+from .conftest import TINY_PLANNER
 
 
 def is_fused(optimizer: Optimizer) -> bool:
@@ -38,20 +40,25 @@ def test_unless_told_so_only_cuda_is_fused():
     assert not is_fused(optimizer)
 
 
+def saved_and_read(policy: HDPConfig, optimizer: AdamWConfig, folder: Path) -> TrainPipelineConfig:
+    TrainPipelineConfig(DatasetConfig("local/none"), policy=policy, optimizer=optimizer).save_pretrained(folder)
+    return TrainPipelineConfig.from_pretrained(folder)
+
+
 @pytest.mark.parametrize("fused", [None, True, False])
 def test_the_choice_is_kept_in_the_train_config(tmp_path, fused):
     policy = HDPConfig(**TINY_PLANNER, optimizer_fused=fused, device="cpu", push_to_hub=False)
-    config = TrainPipelineConfig(DatasetConfig("local/none"), policy=policy, optimizer=policy.get_optimizer_preset())
-    config.save_pretrained(tmp_path)
-    loaded = TrainPipelineConfig.from_pretrained(tmp_path)
-    assert loaded.policy.optimizer_fused == fused
-    assert loaded.optimizer == config.optimizer
-    assert type(loaded.optimizer) is FusedAdamWConfig
+    config = saved_and_read(policy, policy.get_optimizer_preset(), tmp_path)
+    assert config.policy.optimizer_fused == fused
+    assert config.optimizer == policy.get_optimizer_preset()
+    assert type(config.optimizer) is FusedAdamWConfig
 
 
-def test_a_train_config_with_plain_adamw_is_still_read():
-    config = TrainPipelineConfig.from_pretrained(REPOSITORY / "checkpoints/xarm_sorting")
+def test_a_train_config_with_plain_adamw_keeps_it(tmp_path):
+    policy = HDPConfig(**TINY_PLANNER, device="cpu", push_to_hub=False)
+    config = saved_and_read(policy, AdamWConfig(lr=3e-4), tmp_path)
     assert type(config.optimizer) is AdamWConfig
+    assert config.optimizer.lr == 3e-4
 
 
 def test_a_run_that_goes_on_on_another_device_takes_what_suits_this_one(tmp_path):

@@ -168,8 +168,10 @@ def main() -> None:
         lerobot_train.main()
     except OutOfTimeError:
         logging.info("Out of time after %g minutes. Go on with --resume=true.", options.max_train_minutes)
-        if torch.distributed.is_initialized():
-            torch.distributed.destroy_process_group()
+    # The exception held the model until here. Freed after its process group, the model would end the threads of Gloo
+    # while it holds the lock of the interpreter, which one of them may be waiting for.
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 if __name__ == "__main__":
