@@ -111,11 +111,13 @@ def main() -> None:
         "curve": curve,
     }
     FOLDER.mkdir(parents=True, exist_ok=True)
+    file = FOLDER / f"{planner}_{task}.json"
+    unfinished = file.with_suffix(".unfinished")
     for sampler, calls in product(options.samplers, options.calls):
         curve.append(evaluate(options.checkpoint, env, sampler, calls, options.episodes))
         print(curve[-1], flush=True)
-        file = FOLDER / f"{planner}_{task}.json"
-        file.write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")  # what there is so far
+        unfinished.write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
+    unfinished.rename(file)
     write_page()
 
 

@@ -10,22 +10,24 @@ from contextlib import contextmanager
 
 
 def exit_when_terminated() -> None:
-    """Leave by an exception on SIGTERM, so that what is finished is kept."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("hdp-record: terminated; go on with --resume=true"))
+    """Leave by an exception on SIGTERM, as Python does on Ctrl-C."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("terminated; the same command with --resume=true goes on"))
 
 
 @contextmanager
-def deferred_signals() -> Iterator[None]:
-    """Let SIGTERM and Ctrl-C wait for the end of a block. Only the main thread is ever interrupted."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+def deferred_signals() -> Iterator[list[int]]:
+    """Let SIGTERM and Ctrl-C wait for the end of a block, which gets the list of those that have arrived.
+
+    In another thread than the main one, which no signal interrupts, the list stays empty.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    handlers = {number: handler for number, handler in handlers.items() if handler != signal.SIG_IGN}
     arrived: list[int] = []
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for number in handlers:
         signal.signal(number, lambda number, _: arrived.append(number))
     try:
-        yield
+        yield arrived
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
@@ -49,6 +51,6 @@ def when_parent_ends(action: Callable[[], None]) -> None:
 
 
 def end_with_parent() -> None:
-    """Leave as on SIGTERM when the parent is gone."""
-    exit_when_terminated()
+    """Get SIGTERM when the parent is gone; leave Ctrl-C to it, as a terminal sends that to both."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     when_parent_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))

@@ -103,6 +103,10 @@ class Episode(NamedTuple):
     symbols: list[str]
     score: float
 
+    @property
+    def succeeded(self) -> bool:
+        return bool(self.columns[SUCCESS][-1])
+
 
 class Shard(NamedTuple):
     """A part of a recording: the episodes from `start` to before `stop`."""
@@ -206,16 +210,16 @@ def dataset_features(config: RecordConfig) -> dict[str, dict[str, Any]]:
     }
 
 
-def record_episodes(config: RecordConfig, episodes: range) -> Iterator[tuple[Episode, int]]:
-    """Successful episodes in order, each with the number of attempts that failed before it."""
+def attempt_episodes(config: RecordConfig, episodes: range) -> Iterator[tuple[int, int, Episode]]:
+    """For each episode, by its index, attempts 0, 1, ... until one succeeds."""
     env = gym.make(config.env.gym_id, disable_env_checker=True, **config.env.gym_kwargs)
     expert = EXPERTS[config.env.gym_id]
     try:
         for index in episodes:
             for attempt in count():
                 episode = demonstrate(env, expert, episode_seed(config.seed, index, attempt), config.env.features_map)
-                if episode.columns[SUCCESS][-1]:
-                    yield episode, attempt
+                yield index, attempt, episode
+                if episode.succeeded:
                     break
     finally:
         env.close()
@@ -224,50 +228,38 @@ def record_episodes(config: RecordConfig, episodes: range) -> Iterator[tuple[Epi
 def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = None) -> None:
     """Record a shard, or what is missing of it.
 
-    SIGTERM and Ctrl-C leave what is finished; after SIGKILL, the shard begins again.
+    SIGTERM and Ctrl-C wait for the episode that is recorded; after SIGKILL, the shard begins again.
+
+    Raises:
+        InterruptedError: a signal has arrived, and its handler did not end the process.
     """
     if is_complete(shard):
         return
-    datasets.disable_progress_bars()  # one for every episode otherwise
-    av.logging.set_libav_level(av.logging.WARNING)
-    os.environ.setdefault("SVT_LOG", "1")  # errors only, of the AV1 encoder
-    dataset_writer.embed_images = _embed_images_if_any
-    task = config.env.planning_task
-    # Videos are encoded while an episode is written, frame by frame; the queue holds a whole one, so that none drops.
-    encoding = {"streaming_encoding": True, "encoder_queue_maxsize": task.horizon, "encoder_threads": 1}
-    if shard.root.exists() and not shard.done_file.exists():
-        shutil.rmtree(shard.root)  # killed while it was written: its files have no footers
-    if shard.root.exists():
-        failed = failed_attempts(shard)
-        dataset = LeRobotDataset.resume(config.dataset.repo_id, root=shard.root, video_backend="pyav", **encoding)
-    else:
-        failed = {}
-        dataset = LeRobotDataset.create(
-            config.dataset.repo_id,
-            fps=task.fps,
-            features=dataset_features(config),
-            root=shard.root,
-            robot_type=task.robot_type,
-            use_videos=config.dataset.video,
-            video_backend="pyav",
-            **encoding,
-        )
+    with deferred_signals() as signals:
+        _record_missing_episodes(config, shard, signals, progress)
+    if signals:
+        raise InterruptedError("interrupted; go on with --resume=true")
+
+
+def _record_missing_episodes(config: RecordConfig, shard: Shard, signals: list[int], progress: tqdm | None) -> None:
+    """Record what a shard lacks, at most to the end of the episode during which `signals` gets an entry."""
+    dataset = _open_shard(config, shard)
+    failed = failed_attempts(shard) if shard.done_file.exists() else {}
     shard.done_file.unlink(missing_ok=True)
-    start = shard.start + dataset.meta.total_episodes
+    missing = range(shard.start + dataset.meta.total_episodes, shard.stop)
     writing = False
     try:
-        for index, (episode, attempts) in enumerate(record_episodes(config, range(start, shard.stop)), start):
-            writing = True
-            with deferred_signals():
-                for frame in range(len(episode.columns[ACTION])):
-                    row = {key: column[frame] for key, column in episode.columns.items()}
-                    dataset.add_frame({**row, "task": task.instruction})
-                dataset.save_episode()
-                if attempts:
-                    failed[index] = attempts
+        for index, attempt, episode in attempt_episodes(config, missing):
+            if episode.succeeded:
+                writing = True
+                _write(dataset, episode, config.env.planning_task.instruction)
                 writing = False
-            if progress is not None:
-                progress.update()
+                if attempt:
+                    failed[index] = attempt
+                if progress is not None:
+                    progress.update()
+            if signals:
+                break
     finally:
         dataset.finalize()
         if writing or not dataset.meta.total_episodes:
@@ -278,12 +270,39 @@ def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = Non
             unfinished.replace(shard.done_file)  # at once, whatever interrupts
 
 
-def record_shard_in_worker(config: RecordConfig, shard: Shard) -> None:
-    """`record_shard`, after which a terminated process takes no other shard."""
-    try:
-        record_shard(config, shard)
-    except SystemExit:
-        os._exit(1)
+def _open_shard(config: RecordConfig, shard: Shard) -> LeRobotDataset:
+    """A shard's dataset, to which episodes can be added."""
+    datasets.disable_progress_bars()  # one for every episode otherwise
+    av.logging.set_libav_level(av.logging.WARNING)
+    os.environ.setdefault("SVT_LOG", "1")  # errors only, of the AV1 encoder
+    dataset_writer.embed_images = _embed_images_if_any
+    task = config.env.planning_task
+    # Videos are encoded while an episode is written, frame by frame; the queue holds a whole one, so that none drops.
+    options: dict[str, Any] = {
+        "root": shard.root,
+        "video_backend": "pyav",
+        "streaming_encoding": True,
+        "encoder_queue_maxsize": task.horizon,
+        "encoder_threads": 1,
+    }
+    if shard.root.exists() and not shard.done_file.exists():
+        shutil.rmtree(shard.root)  # killed while it was written: its files have no footers
+    if shard.root.exists():
+        return LeRobotDataset.resume(config.dataset.repo_id, **options)
+    return LeRobotDataset.create(
+        config.dataset.repo_id,
+        fps=task.fps,
+        features=dataset_features(config),
+        robot_type=task.robot_type,
+        use_videos=config.dataset.video,
+        **options,
+    )
+
+
+def _write(dataset: LeRobotDataset, episode: Episode, instruction: str) -> None:
+    for frame in range(len(episode.columns[ACTION])):
+        dataset.add_frame({**{key: column[frame] for key, column in episode.columns.items()}, "task": instruction})
+    dataset.save_episode()
 
 
 _embed_images = dataset_writer.embed_images
@@ -316,7 +335,7 @@ def record(config: RecordConfig) -> LeRobotDataset:
         else:
             context = multiprocessing.get_context("forkserver")
             with ProcessPoolExecutor(config.num_workers, context, initializer=end_with_parent) as executor:
-                futures = {executor.submit(record_shard_in_worker, config, shard): shard for shard in shards}
+                futures = {executor.submit(record_shard, config, shard): shard for shard in shards}
                 try:
                     for future in as_completed(futures):
                         future.result()

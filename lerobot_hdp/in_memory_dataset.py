@@ -5,7 +5,7 @@ one gather in each column. PyTorch's data loader asks for it through `__getitems
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -40,23 +40,25 @@ class InMemoryDataset(LeRobotDataset):
     Cameras are decoded once and kept as uint8.
 
     Args:
-        dataset: what to load; `unsupported(dataset)` must be None.
+        dataset: what to load; `unsupported(dataset, leave_out)` must be None.
+        leave_out: cameras that the samples need not have.
 
     Raises:
         ValueError: it cannot be held in memory.
     """
 
-    def __init__(self, dataset: LeRobotDataset):
+    def __init__(self, dataset: LeRobotDataset, leave_out: Collection[str] = ()):
         vars(self).update(vars(dataset))
-        if (reason := unsupported(dataset)) is not None:
+        if (reason := unsupported(dataset, leave_out)) is not None:
             raise ValueError(f"{dataset.repo_id} cannot be held in memory: {reason}")
-        self._columns, self._words = _read_columns(dataset)
+        self._cameras = [key for key in self.meta.camera_keys if key not in leave_out]
+        self._columns, self._words = _read_columns(dataset, leave_out)
         episodes, inverse, lengths = self._columns["episode_index"].unique_consecutive(
             return_inverse=True, return_counts=True
         )
         timestamps = self._columns["timestamp"].split(lengths.tolist())
         seconds = {episode: times.tolist() for episode, times in zip(episodes.tolist(), timestamps, strict=True)}
-        for key in self.meta.video_keys:
+        for key in (key for key in self._cameras if key in self.meta.video_keys):
             self._columns[key] = _join(dataset.num_frames, _decode_videos(dataset, key, seconds))
         ends = lengths.cumsum(0)
         self._first, self._last = (ends - lengths)[inverse], (ends - 1)[inverse]
@@ -83,45 +85,48 @@ class InMemoryDataset(LeRobotDataset):
 
     def _finish_images(self, batch: Batch) -> None:
         """uint8 to float where LeRobot has it so, and the image transforms, sample by sample as LeRobot draws them."""
-        for key in self.meta.camera_keys:
+        for key in self._cameras:
             if key in self.meta.image_keys or not self._return_uint8:
                 batch[key] = batch[key].float() / 255
         if self.image_transforms is not None:
-            cameras = self.meta.camera_keys
-            samples = zip(*(batch[key] for key in cameras), strict=True)
+            samples = zip(*(batch[key] for key in self._cameras), strict=True)
             images = [[self.image_transforms(image) for image in sample] for sample in samples]
-            batch.update(zip(cameras, map(torch.stack, zip(*images, strict=True)), strict=True))
+            batch.update(zip(self._cameras, map(torch.stack, zip(*images, strict=True)), strict=True))
 
 
-def unsupported(dataset: LeRobotDataset) -> str | None:
+def unsupported(dataset: LeRobotDataset, leave_out: Collection[str] = ()) -> str | None:
     """Why a dataset cannot be held in memory, in words; None if it can."""
     if not isinstance(dataset, LeRobotDataset):
         return "it is streamed"
-    if dataset.meta.depth_keys:
-        return f"{dataset.meta.depth_keys[0]} holds depth maps"
     for key, feature in dataset.meta.features.items():
-        if key not in LANGUAGE_COLUMNS and not feature["dtype"].startswith(SUPPORTED_DTYPES):
+        if key in leave_out or key in LANGUAGE_COLUMNS:
+            continue
+        if key in dataset.meta.depth_keys:
+            return f"{key} holds depth maps"
+        if not feature["dtype"].startswith(SUPPORTED_DTYPES):
             return f"{key} holds values of type {feature['dtype']}"
     return None
 
 
-def memory_needed(dataset: LeRobotDataset) -> int:
+def memory_needed(dataset: LeRobotDataset, leave_out: Collection[str] = ()) -> int:
     """Bytes that the dataset takes as tensors."""
     per_frame = 0
     for key, feature in dataset.meta.features.items():
-        if key not in LANGUAGE_COLUMNS and feature["dtype"] != "string":
+        if key not in leave_out and key not in LANGUAGE_COLUMNS and feature["dtype"] != "string":
             size = 1 if key in dataset.meta.camera_keys else 8 if "int" in feature["dtype"] else 4
             per_frame += size * math.prod(feature["shape"])
     return per_frame * dataset.num_frames
 
 
-def _read_columns(dataset: LeRobotDataset) -> tuple[dict[str, Tensor], dict[str, list[str]]]:
+def _read_columns(
+    dataset: LeRobotDataset, leave_out: Collection[str]
+) -> tuple[dict[str, Tensor], dict[str, list[str]]]:
     """Columns of the dataset's table as tensors (N, ...), of the types that LeRobot makes them; and those of words."""
     table = dataset.hf_dataset.with_format(None)
     columns, words = {}, {}
     for key in table.column_names:
-        if key in LANGUAGE_COLUMNS:
-            continue  # LeRobot leaves them out of a batch, too
+        if key in leave_out or key in LANGUAGE_COLUMNS:
+            continue  # LeRobot leaves language out of a batch, too
         if key in dataset.meta.image_keys:
             images = (np.atleast_3d(np.array(row[key])) for row in table.select_columns(key))
             columns[key] = _join(len(table), (torch.from_numpy(image).permute(2, 0, 1)[None] for image in images))

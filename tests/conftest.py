@@ -35,11 +35,16 @@ DIFFUSION_FLAGS += ("--policy.pretrained_backbone_weights=null",)
 
 
 def run_command(command: str, *arguments, check: bool = True, cwd: Path | None = None) -> subprocess.CompletedProcess:
-    """Run an installed command, as a user would, without a network."""
+    """Run an installed command, as a user would, without a network; one that hangs is an error."""
     executable = Path(sys.executable).with_name(command)
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
     result = subprocess.run(
-        [executable, *map(str, arguments)], capture_output=True, text=True, cwd=cwd or REPOSITORY, env=environment
+        [executable, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd or REPOSITORY,
+        env={**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"},
+        timeout=300,
+        check=False,
     )
     if check and result.returncode:
         raise AssertionError(f"{command} failed:\n{result.stdout[-2000:]}\n{result.stderr[-6000:]}")

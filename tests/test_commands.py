@@ -101,7 +101,6 @@ def test_lerobot_eval_scores_the_policy(checkpoint, tmp_path):
         *ENV_FLAGS,
         "--eval.n_episodes=4",
         "--eval.batch_size=2",
-        "--eval.use_async_envs=false",
         f"--output_dir={tmp_path}",
     )
     overall = json.loads((tmp_path / "eval_info.json").read_text())["overall"]

@@ -14,6 +14,7 @@ import torch
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
+from lerobot.policies import ACTConfig
 from lerobot.scripts import lerobot_train
 from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from safetensors.torch import load_file
@@ -157,13 +158,13 @@ def test_memory_needed_counts_every_tensor(camera_root):
 
 @pytest.fixture
 def open_datasets(monkeypatch):
-    """Open datasets as hdp-train does: `open_datasets(root, max_gib, **dataset_config) -> datasets, num_workers`."""
+    """Open them as hdp-train does: `open_datasets(root, max_gib, policy, **config) -> datasets, num_workers`."""
     for name in ("make_train_eval_datasets", "lerobot_collate_fn", "save_checkpoint"):
         monkeypatch.setattr(lerobot_train, name, getattr(lerobot_train, name))
 
-    def open_(root, max_gib=1.0, **kwargs):
+    def open_(root, max_gib=1.0, policy=None, **kwargs):
         dataset = DatasetConfig("test/dataset", root=str(root), video_backend="pyav", **kwargs)
-        config = TrainPipelineConfig(dataset, policy=HDPConfig(horizon=3, device="cpu"), num_workers=3)
+        config = TrainPipelineConfig(dataset, policy=policy or ACTConfig(device="cpu"), num_workers=3)
         hdp_train.hold_datasets_in_memory(max_gib)
         return lerobot_train.make_train_eval_datasets(config), config.num_workers
 
@@ -176,6 +177,17 @@ def test_workers_are_kept_for_image_transforms_alone(camera_root, open_datasets,
     datasets, num_workers = open_datasets(camera_root, image_transforms=ImageTransformsConfig(enable=enable))
     assert isinstance(datasets[0], InMemoryDataset)
     assert num_workers == expected
+
+
+def test_cameras_take_no_memory_and_no_time_when_the_policy_has_no_use_for_them(camera_root, open_datasets):
+    whole = memory_needed(LeRobotDataset("test/cameras", root=camera_root)) / hdp_train.GIB
+    planner = HDPConfig(horizon=3, device="cpu")
+    (dataset, _), _ = open_datasets(camera_root, max_gib=whole / 2, policy=planner)
+    [batch] = dataset.__getitems__([3, 5])
+    assert batch["action"].shape == (2, 3, 3)
+    assert not any("images" in key for key in batch)
+    (dataset, _), _ = open_datasets(camera_root, max_gib=whole / 2)
+    assert not isinstance(dataset, InMemoryDataset)
 
 
 @pytest.mark.parametrize(("share", "held"), [(1.1, True), (0.75, False)])

@@ -1,6 +1,7 @@
 """`hdp-record`: the data contract, interruptions, and what cannot be recorded."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -117,23 +118,28 @@ def uninterrupted(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     ("signal_number", "num_workers"),
-    [(signal.SIGTERM, 1), (signal.SIGKILL, 1), (signal.SIGTERM, 2), (signal.SIGKILL, 2)],
+    [(signal.SIGTERM, 1), (signal.SIGKILL, 1), (signal.SIGTERM, 2), (signal.SIGKILL, 2), (signal.SIGINT, 2)],
 )
 def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_path, signal_number, num_workers):
     flags = flags_of_80(tmp_path / "stopped")
     command = [Path(sys.executable).with_name("hdp-record"), *flags, f"--num_workers={num_workers}"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     first_shard_done = tmp_path / "stopped.partial" / "episodes_000000.done"
     while not first_shard_done.exists():
         assert process.poll() is None
         time.sleep(0.01)
     workers = psutil.Process(process.pid).children(recursive=True)
-    process.send_signal(signal_number)
-    process.wait()
+    if signal_number == signal.SIGINT:
+        os.killpg(process.pid, signal_number)  # as a terminal does
+    else:
+        process.send_signal(signal_number)
+    process.wait(timeout=20)
     _, still_running = psutil.wait_procs(workers, timeout=20)
     assert not still_running
     assert not (tmp_path / "stopped").exists()
     shards = [done.with_suffix("") for done in first_shard_done.parent.glob("*.done")]
+    if signal_number != signal.SIGKILL:
+        assert {path for path in first_shard_done.parent.iterdir() if path.is_dir()} == set(shards), "a shard is lost"
     assert load_info(first_shard_done.with_suffix("")).total_episodes == 25
     assert sum(load_info(shard).total_episodes for shard in shards) < 80
 

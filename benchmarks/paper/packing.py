@@ -128,7 +128,12 @@ def export(checkpoint: Path, target: Path, max_file_size: str = "5GB") -> None:
         checkpoint: a `pretrained_model` folder.
         target: a new folder of the same form, if one file is enough.
         max_file_size: e.g. `15MB`. What needs more is written as several files, for `join_files`.
+
+    Raises:
+        FileExistsError: there is such a folder already.
     """
+    if target.exists():
+        raise FileExistsError(f"{target} exists already: delete it first")
     policy, *_ = load_policy(checkpoint)
     if policy.ema is not None:
         policy.planner.load_state_dict(policy.ema.module.state_dict())

@@ -11,6 +11,7 @@ Example:
 """
 
 import argparse
+import gc
 import logging
 import sys
 import time
@@ -44,12 +45,14 @@ def hold_datasets_in_memory(max_gib: float) -> None:
         users_num_workers = cfg.num_workers
         train_and_eval = make_datasets(cfg)
         datasets = [dataset for dataset in train_and_eval if dataset is not None]
-        if (reason := _why_not_in_memory(datasets, max_gib)) is not None:
+        # The planners take no images: their cameras need not be decoded.
+        leave_out = datasets[0].meta.camera_keys if isinstance(cfg.policy, HDPConfig) else []
+        if (reason := _why_not_in_memory(datasets, leave_out, max_gib)) is not None:
             logging.warning("The dataset is read item by item, as by lerobot-train: %s", reason)
             return train_and_eval
         if all(dataset.image_transforms is None for dataset in datasets):
             cfg.num_workers = 0  # there is nothing to wait for; image transforms are made sample by sample
-        return tuple(None if dataset is None else InMemoryDataset(dataset) for dataset in train_and_eval)
+        return tuple(None if dataset is None else InMemoryDataset(dataset, leave_out) for dataset in train_and_eval)
 
     def save_with_users_num_workers(*args: Any, cfg: TrainPipelineConfig, **kwargs: Any) -> None:
         cfg.num_workers = users_num_workers  # for whoever resumes with lerobot-train
@@ -68,18 +71,23 @@ def evaluate_where_plans_begin() -> None:
         train, held_out = make_datasets(cfg)
         if held_out is None or not isinstance(cfg.policy, HDPConfig) or cfg.policy.plan_from != "episode_start":
             return train, held_out
-        frames = np.flatnonzero(held_out.hf_dataset.with_format("numpy")["frame_index"][:] == 0)
-        return train, Subset(held_out, frames[: cfg.max_eval_samples or None].tolist())
+        columns = held_out.hf_dataset.with_format("numpy")
+        frames = np.flatnonzero(columns["frame_index"][:] == 0)
+        if cfg.max_eval_samples > 0:  # of each task as many, as LeRobot takes them
+            tasks = columns["task_index"][:][frames]
+            of_each = [frames[tasks == task] for task in np.unique(tasks)]
+            frames = np.concatenate([some[: max(1, cfg.max_eval_samples // len(of_each))] for some in of_each])
+        return train, Subset(held_out, frames.tolist())
 
     lerobot_train.make_train_eval_datasets = make_datasets_of_first_frames
 
 
-def _why_not_in_memory(datasets: list[LeRobotDataset], max_gib: float) -> str | None:
+def _why_not_in_memory(datasets: list[LeRobotDataset], leave_out: list[str], max_gib: float) -> str | None:
     """What keeps datasets from being held in memory together, in words; None: nothing."""
     for dataset in datasets:
-        if (reason := unsupported(dataset)) is not None:
+        if (reason := unsupported(dataset, leave_out)) is not None:
             return reason
-    needed = sum(map(memory_needed, datasets)) / GIB
+    needed = sum(memory_needed(dataset, leave_out) for dataset in datasets) / GIB
     return f"it needs {needed:.1f} GiB, more than --max_memory_gib={max_gib:g}" if needed > max_gib else None
 
 
@@ -170,6 +178,7 @@ def main() -> None:
         logging.info("Out of time after %g minutes. Go on with --resume=true.", options.max_train_minutes)
     # The exception held the model until here. Freed after its process group, the model would end the threads of Gloo
     # while it holds the lock of the interpreter, which one of them may be waiting for.
+    gc.collect()
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
 
