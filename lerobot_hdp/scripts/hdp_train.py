@@ -23,6 +23,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_train
 from lerobot.utils.collate import lerobot_collate_fn
+from torch.distributed import ProcessGroup
 from torch.utils.data import Dataset, Subset
 
 from lerobot_hdp.configuration_hdp import HDPConfig
@@ -80,6 +81,27 @@ def evaluate_where_plans_begin() -> None:
         return train, Subset(held_out, frames.tolist())
 
     lerobot_train.make_train_eval_datasets = make_datasets_of_first_frames
+
+
+def hold_process_group() -> list[ProcessGroup]:
+    """Let a distributed training's process group outlive its model, which `lerobot-train` frees after the group.
+
+    The model would be the last to hold the group, and end the threads of Gloo while it has the interpreter's lock, for
+    which one of them may be waiting: the process would hang at its very end. Python's own reference frees the lock.
+
+    Returns:
+        What will hold the group, until it is cleared.
+    """
+    held: list[ProcessGroup] = []
+    make_datasets = lerobot_train.make_train_eval_datasets
+
+    def make_datasets_and_hold(cfg: TrainPipelineConfig) -> Any:
+        if torch.distributed.is_initialized():
+            held.append(torch.distributed.group.WORLD)
+        return make_datasets(cfg)
+
+    lerobot_train.make_train_eval_datasets = make_datasets_and_hold
+    return held
 
 
 def _why_not_in_memory(datasets: list[LeRobotDataset], leave_out: list[str], max_gib: float) -> str | None:
@@ -170,17 +192,17 @@ def main() -> None:
     lerobot_train.submit_to_hf = refuse_to_submit
     hold_datasets_in_memory(options.max_memory_gib)
     evaluate_where_plans_begin()
+    process_group = hold_process_group()
     if options.max_train_minutes is not None:
         stop_after(options.max_train_minutes)
     try:
         lerobot_train.main()
     except OutOfTimeError:
         logging.info("Out of time after %g minutes. Go on with --resume=true.", options.max_train_minutes)
-    # The exception held the model until here. Freed after its process group, the model would end the threads of Gloo
-    # while it holds the lock of the interpreter, which one of them may be waiting for.
-    gc.collect()
-    if torch.distributed.is_initialized():
-        torch.distributed.destroy_process_group()
+        if torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+    gc.collect()  # the model
+    process_group.clear()
 
 
 if __name__ == "__main__":
