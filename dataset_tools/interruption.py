@@ -21,8 +21,7 @@ def deferred_signals() -> Iterator[list[int]]:
     In another thread than the main one, which no signal interrupts, the list stays empty.
     """
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
-    handlers = {number: signal.getsignal(number) for number in numbers}
-    handlers = {number: handler for number, handler in handlers.items() if handler != signal.SIG_IGN}
+    handlers = {number: handler for number in numbers if (handler := signal.getsignal(number)) != signal.SIG_IGN}
     arrived: list[int] = []
     for number in handlers:
         signal.signal(number, lambda number, _: arrived.append(number))

@@ -98,9 +98,7 @@ def unsupported(dataset: LeRobotDataset, leave_out: Collection[str] = ()) -> str
     """Why a dataset cannot be held in memory, in words; None if it can."""
     if not isinstance(dataset, LeRobotDataset):
         return "it is streamed"
-    for key, feature in dataset.meta.features.items():
-        if key in leave_out or key in LANGUAGE_COLUMNS:
-            continue
+    for key, feature in _held_features(dataset, leave_out).items():
         if key in dataset.meta.depth_keys:
             return f"{key} holds depth maps"
         if not feature["dtype"].startswith(SUPPORTED_DTYPES):
@@ -111,11 +109,17 @@ def unsupported(dataset: LeRobotDataset, leave_out: Collection[str] = ()) -> str
 def memory_needed(dataset: LeRobotDataset, leave_out: Collection[str] = ()) -> int:
     """Bytes that the dataset takes as tensors."""
     per_frame = 0
-    for key, feature in dataset.meta.features.items():
-        if key not in leave_out and key not in LANGUAGE_COLUMNS and feature["dtype"] != "string":
+    for key, feature in _held_features(dataset, leave_out).items():
+        if feature["dtype"] != "string":
             size = 1 if key in dataset.meta.camera_keys else 8 if "int" in feature["dtype"] else 4
             per_frame += size * math.prod(feature["shape"])
     return per_frame * dataset.num_frames
+
+
+def _held_features(dataset: LeRobotDataset, leave_out: Collection[str]) -> dict[str, dict[str, Any]]:
+    """The features that a batch has: not what is left out, nor language, which LeRobot leaves out of a batch, too."""
+    features = dataset.meta.features.items()
+    return {key: feature for key, feature in features if key not in leave_out and key not in LANGUAGE_COLUMNS}
 
 
 def _read_columns(
@@ -124,13 +128,14 @@ def _read_columns(
     """Columns of the dataset's table as tensors (N, ...), of the types that LeRobot makes them; and those of words."""
     table = dataset.hf_dataset.with_format(None)
     columns, words = {}, {}
+    held = _held_features(dataset, leave_out)
     for key in table.column_names:
-        if key in leave_out or key in LANGUAGE_COLUMNS:
-            continue  # LeRobot leaves language out of a batch, too
+        if key not in held:
+            continue
         if key in dataset.meta.image_keys:
             images = (np.atleast_3d(np.array(row[key])) for row in table.select_columns(key))
             columns[key] = _join(len(table), (torch.from_numpy(image).permute(2, 0, 1)[None] for image in images))
-        elif dataset.meta.features[key]["dtype"] == "string":
+        elif held[key]["dtype"] == "string":
             words[key] = table[key][:]
         else:
             values = np.stack(table.select_columns(key).with_format("numpy")[:][key])

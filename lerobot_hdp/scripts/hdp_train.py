@@ -17,6 +17,7 @@ import sys
 import time
 from typing import Any
 
+import datasets
 import numpy as np
 import torch
 from lerobot.configs.train import TrainPipelineConfig
@@ -74,11 +75,11 @@ def evaluate_where_plans_begin() -> None:
             return train, held_out
         columns = held_out.hf_dataset.with_format("numpy")
         frames = np.flatnonzero(columns["frame_index"][:] == 0)
-        if cfg.max_eval_samples > 0:  # of each task as many, as LeRobot takes them
-            tasks = columns["task_index"][:][frames]
-            of_each = [frames[tasks == task] for task in np.unique(tasks)]
-            frames = np.concatenate([some[: max(1, cfg.max_eval_samples // len(of_each))] for some in of_each])
-        return train, Subset(held_out, frames.tolist())
+        first_frames = Subset(held_out, frames.tolist())
+        # LeRobot looks here when it takes as many of each task for --max_eval_samples.
+        tasks = {"task_index": columns["task_index"][:][frames]}
+        first_frames.hf_dataset = datasets.Dataset.from_dict(tasks)  # type: ignore[attr-defined]
+        return train, first_frames
 
     lerobot_train.make_train_eval_datasets = make_datasets_of_first_frames
 
