@@ -11,7 +11,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
 
 from .encoders import object_sizes
-from .optimizer import FusedAdamWConfig
+from .optimizer import OPTIMIZERS, FusedAdamWConfig, MuonAdamWConfig
 from .processes.gaussian import PREDICTION_TYPES
 from .processes.masked import MASK_SCHEDULES
 from .prompt import encode_prompt
@@ -35,6 +35,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "object_tokens": True,
         "observation_weight_std": 0.5,
         "symbol_loss_weight": 1 / 300,
+        "optimizer_type": "muon",
         "optimizer_lr": 1e-3,
         "scheduler_warmup_steps": 100,
         "sampler": "confidence",
@@ -49,6 +50,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "object_tokens": False,
         "observation_weight_std": 0.02,
         "symbol_loss_weight": 1 / 30,
+        "optimizer_type": "adamw",
         "optimizer_lr": 1e-4,
         "scheduler_warmup_steps": 1000,
         "sampler": "ddpm",
@@ -107,8 +109,11 @@ class HDPConfig(PreTrainedConfig):
         compile_model, compile_mode: run the denoiser through `torch.compile`.
         dtype: `float32`, or `bfloat16` for autocast in training and planning.
 
-        optimizer_*, scheduler_*: AdamW with a linear warm-up and a cosine decay to the last step.
-            `optimizer_fused`: update all parameters in one kernel; None: on CUDA.
+        optimizer_type: `muon` updates the matrices between hidden layers by Muon and the rest by AdamW (optimizer.py),
+            `adamw` all by AdamW.
+        optimizer_*, scheduler_*: of these, with a linear warm-up and a cosine decay to the last step.
+            `optimizer_betas`, `optimizer_eps`: of AdamW; `optimizer_momentum`: of Muon; `optimizer_fused`: AdamW updates
+            all parameters in one kernel; None: on CUDA.
 
     Raises:
         ParsingError: a value that cannot be. It is draccus' own error, because LeRobot's commands hide the message of
@@ -157,9 +162,11 @@ class HDPConfig(PreTrainedConfig):
     compile_mode: str = "default"
     dtype: str = "float32"
 
+    optimizer_type: str | None = None
     optimizer_lr: float | None = None
     optimizer_betas: tuple[float, float] = (0.9, 0.95)
     optimizer_eps: float = 1e-8
+    optimizer_momentum: float = 0.95
     optimizer_weight_decay: float = 1e-3
     optimizer_grad_clip_norm: float = 10.0
     optimizer_fused: bool | None = None
@@ -185,6 +192,7 @@ class HDPConfig(PreTrainedConfig):
         _check_choice("plan_from", self.plan_from, ["episode_start", "any_frame"])
         _check_choice("prediction_type", self.prediction_type, PREDICTION_TYPES)
         _check_choice("sampler", self.sampler, SAMPLERS)
+        _check_choice("optimizer_type", self.optimizer_type, OPTIMIZERS)
         _check_choice("mask_schedule", self.mask_schedule, MASK_SCHEDULES)
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
         if self.n_obs_steps != 1:
@@ -308,14 +316,17 @@ class HDPConfig(PreTrainedConfig):
         return self.horizon
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:
-        return FusedAdamWConfig(
-            lr=self.optimizer_lr,
-            betas=self.optimizer_betas,
-            eps=self.optimizer_eps,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-            fused=self.optimizer_fused,
-        )
+        options: dict[str, Any] = {
+            "lr": self.optimizer_lr,
+            "betas": self.optimizer_betas,
+            "eps": self.optimizer_eps,
+            "weight_decay": self.optimizer_weight_decay,
+            "grad_clip_norm": self.optimizer_grad_clip_norm,
+            "fused": self.optimizer_fused,
+        }
+        if self.optimizer_type == "muon":
+            return MuonAdamWConfig(**options, momentum=self.optimizer_momentum)
+        return FusedAdamWConfig(**options)
 
     def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)

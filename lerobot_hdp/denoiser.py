@@ -140,6 +140,12 @@ class Denoiser(nn.Module):
         nn.init.normal_(self.positions, std=0.02)
         nn.init.normal_(self.condition_positions, std=0.02)
 
+    @property
+    def hidden_matrices(self) -> list[nn.Parameter]:
+        """The weights between hidden layers; embeddings and heads are not among them."""
+        layers = (self.condition_encoder, self.decoder)
+        return [parameter for layer in layers for parameter in layer.parameters() if parameter.ndim == 2]
+
     def forward(
         self, motion: Tensor, symbols: Tensor | None, observation: Tensor, motion_level: Tensor, symbol_level: Tensor
     ) -> Prediction:

@@ -14,7 +14,6 @@ from lerobot.utils.constants import ACTION
 from safetensors import SafetensorError
 from torch import Generator, Tensor, nn
 
-from . import processor_hdp  # noqa: F401 (a checkpoint's processors can be loaded wherever the policy can)
 from .candidates import PARTIAL_MOTION_CANDIDATES, best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
@@ -24,6 +23,7 @@ from .moving_average import MovingAverage
 from .optimizer import parameter_groups
 from .plan import Plan, PlanCheck, PlanPrompt
 from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess, Process, SymbolProcess
+from .processor_hdp import widen_narrow_ranges
 from .prompt import choose_placement, encode_prompt, shared_tokens
 from .sampling import Denoise, DenoisingState, sample_plan
 from .vocabulary import FREE, FREE_SYMBOL, PAD_ID, Vocabulary
@@ -69,6 +69,8 @@ class HDPPolicy(PreTrainedPolicy):
 
     Args:
         config: the planner's configuration, complete with what the dataset says.
+        dataset_stats: of the dataset that the policy is to be trained on; see `widen_narrow_ranges`. LeRobot makes the
+            normaliser of the same ones afterwards, in fine-tuning too.
         dataset_meta: metadata of the dataset that the policy is to be trained on; its episodes are checked against
             the horizon.
     """
@@ -81,6 +83,7 @@ class HDPPolicy(PreTrainedPolicy):
     def __init__(self, config: HDPConfig, dataset_stats: Any = None, dataset_meta: Any = None):
         super().__init__(config)
         config.validate_features()
+        widen_narrow_ranges(config, dataset_stats or {})
         if config.num_candidates > 1 and not self.can_score:
             raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
         if dataset_meta is not None:
@@ -105,7 +108,8 @@ class HDPPolicy(PreTrainedPolicy):
         return Planner(self.config, self.symbol_process.num_states if self.symbol_process else 0)
 
     def get_optim_params(self) -> list[dict]:
-        return parameter_groups(self.planner)
+        matrices = [matrix for denoiser in self.planner.denoisers for matrix in denoiser.hidden_matrices]
+        return parameter_groups(self.planner, matrices if self.config.optimizer_type == "muon" else ())
 
     def reset(self) -> None:
         """Forget the plan in execution. To be called on `env.reset()`."""

@@ -1,13 +1,20 @@
-"""What the planners are trained with: AdamW, fused on a GPU, with weight decay where it belongs."""
+"""What the planners are trained with: Muon for the hidden matrices, AdamW for the rest or for all."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 from typing import Any
 
+import torch
 from lerobot.optim import AdamWConfig, OptimizerConfig
 from lerobot.optim.optimizers import OptimizerParams
 from torch import nn
-from torch.optim import Optimizer
+from torch.optim import Muon, Optimizer
+
+OPTIMIZERS = ["muon", "adamw"]
+"""Values of `HDPConfig.optimizer_type`."""
+FOR_MUON = "for_muon"
+"""Marks a group of parameters, see `parameter_groups`."""
 
 
 @OptimizerConfig.register_subclass("adamw_fused")
@@ -26,17 +33,90 @@ class FusedAdamWConfig(AdamWConfig):
         parameters = chain.from_iterable(group["params"] if isinstance(group, dict) else [group] for group in groups)
         fused = all(parameter.is_cuda for parameter in parameters) if self.fused is None else self.fused
         optimizer = AdamWConfig.build(replace(self, fused=fused), groups)
-
-        def keep_fused(_: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
-            return state | {"param_groups": [group | {"fused": fused} for group in state["param_groups"]]}
-
-        # A run that was stopped on another device goes on with what suits this one.
-        optimizer.register_load_state_dict_pre_hook(keep_fused)
+        _stay_fused(optimizer, fused)
         return optimizer
 
 
-def parameter_groups(network: nn.Module) -> list[dict[str, Any]]:
-    """Parameters with weight decay (matrices of linear layers) and without (the rest), for an optimizer."""
-    decay = [parameter for parameter in network.parameters() if parameter.ndim == 2]
-    no_decay = [parameter for parameter in network.parameters() if parameter.ndim != 2]
-    return [{"params": decay}, {"params": no_decay, "weight_decay": 0.0}]
+@OptimizerConfig.register_subclass("muon_adamw")
+@dataclass
+class MuonAdamWConfig(FusedAdamWConfig):
+    """Muon for the matrices between hidden layers, AdamW for everything else.
+
+    Muon (Jordan et al. 2024, "Muon: An optimizer for hidden layers in neural networks") replaces the momentum of a
+    matrix by the nearest orthogonal one, so that a step moves all its directions alike. Its updates are scaled to be
+    as large as AdamW's are (Liu et al. 2025, "Muon is Scalable for LLM Training"), so that both have one learning rate
+    and one weight decay.
+
+    Attributes:
+        momentum: of Muon.
+    """
+
+    momentum: float = 0.95
+
+    def build(self, params: OptimizerParams) -> Optimizer:
+        """Args:
+            params: of `parameter_groups`.
+
+        Raises:
+            ValueError: no group is marked as Muon's.
+        """
+        groups = [group for group in params if isinstance(group, dict)]
+        for_muon = [{"params": group["params"]} for group in groups if FOR_MUON in group]
+        if not for_muon:
+            raise ValueError(
+                "optimizer.type=muon_adamw has to know the hidden matrices, which the policy tells with "
+                "use_policy_training_preset=true; or set optimizer.type=adamw"
+            )
+        muon = Muon(
+            for_muon,
+            lr=self.lr,
+            weight_decay=self.weight_decay,
+            momentum=self.momentum,
+            adjust_lr_fn="match_rms_adamw",
+        )
+        common = {field.name: getattr(self, field.name) for field in fields(FusedAdamWConfig)}
+        adamw = FusedAdamWConfig(**common).build([group for group in groups if FOR_MUON not in group])
+        return MuonAdamW(muon, adamw)
+
+
+class MuonAdamW(Optimizer):
+    """Two optimizers as one: the form in which LeRobot schedules, saves and resumes them."""
+
+    def __init__(self, muon: Muon, adamw: Optimizer):
+        super().__init__([*muon.param_groups, *adamw.param_groups], {})
+        self._muon, self._adamw = muon, adamw
+        _stay_fused(self, adamw.param_groups[0]["fused"])
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> None:
+        """Update all parameters. No closure is taken."""
+        own = len(self._muon.param_groups)
+        for part, groups in ((self._muon, self.param_groups[:own]), (self._adamw, self.param_groups[own:])):
+            part.param_groups, part.state = groups, self.state  # a resumed run has replaced both
+            part.step()
+
+
+def _stay_fused(optimizer: Optimizer, fused: bool) -> None:
+    """A run that was stopped on another device goes on with what suits this one."""
+
+    def set_fused(_: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+        groups = [group | {"fused": fused} if "fused" in group else group for group in state["param_groups"]]
+        return state | {"param_groups": groups}
+
+    optimizer.register_load_state_dict_pre_hook(set_fused)
+
+
+def parameter_groups(network: nn.Module, hidden_matrices: Iterable[nn.Parameter]) -> list[dict[str, Any]]:
+    """Parameters of a network for an optimizer: Muon's, others with weight decay (matrices), and those without.
+
+    Args:
+        network: to be trained.
+        hidden_matrices: those of its parameters that Muon is to update; AdamW updates all, if there are none.
+    """
+    for_muon = list(hidden_matrices)
+    taken = {id(parameter) for parameter in for_muon}
+    others = [parameter for parameter in network.parameters() if id(parameter) not in taken]
+    decay = [parameter for parameter in others if parameter.ndim == 2]
+    no_decay = [parameter for parameter in others if parameter.ndim != 2]
+    groups: list[dict[str, Any]] = [{"params": decay}, {"params": no_decay, "weight_decay": 0.0}]
+    return [{"params": for_muon, FOR_MUON: True}, *groups] if for_muon else groups

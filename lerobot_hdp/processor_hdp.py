@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.configs import NormalizationMode, PipelineFeatureType, PolicyFeature
 from lerobot.processor import (
     ObservationProcessorStep,
     PolicyAction,
@@ -16,6 +17,9 @@ from torch import Tensor
 
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .vocabulary import FREE, FREE_SYMBOL, PAD_ID
+
+NARROWEST_RANGE = 0.1
+"""What `widen_narrow_ranges` leaves of the widest range."""
 
 
 @ProcessorStepRegistry.register(name="hdp_symbolic_plan")
@@ -73,6 +77,7 @@ def make_hdp_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
     """LeRobot's default processors, and the symbolic plan as token ids."""
+    widen_narrow_ranges(config, dataset_stats or {})
     steps = make_default_policy_processor_steps(config, dataset_stats)
     symbolic_plan = SymbolicPlanProcessorStep(
         symbolic_horizon=config.symbolic_horizon if config.symbol_process else None,
@@ -84,3 +89,24 @@ def make_hdp_pre_post_processors(
         ],
         output_steps=[steps.unnormalize, steps.to_cpu],
     )  # fmt: skip
+
+
+def widen_narrow_ranges(config: HDPConfig, stats: dict[str, dict[str, Any]]) -> None:
+    """Give each component of an observation at least a tenth of the range of that observation's widest, in place.
+
+    Where plans begin, some components never vary, as the orientation of blocks that stand upright. Over all frames they
+    have a tiny range, that of contacts; scaled by it to [-1, 1], a turn by a tenth of a degree would be far beyond all
+    that the planner has seen.
+
+    Args:
+        config: says what is observed, and which of it is normalised by its range.
+        stats: of a dataset; the `min` and `max` of observations are changed.
+    """
+    for key, feature in config.input_features.items():
+        if config.normalization_mapping.get(feature.type.value) is not NormalizationMode.MIN_MAX or key not in stats:
+            continue
+        low, high = (np.asarray(stats[key][bound]) for bound in ("min", "max"))
+        middle, half = (low + high) / 2, (high - low) / 2
+        narrow = half < NARROWEST_RANGE * half.max()
+        stats[key]["min"] = np.where(narrow, middle - NARROWEST_RANGE * half.max(), low)
+        stats[key]["max"] = np.where(narrow, middle + NARROWEST_RANGE * half.max(), high)

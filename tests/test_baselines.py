@@ -146,7 +146,7 @@ class TestContract:
         assert sorted(optimised) == sorted(map(id, trainable))
 
     def test_only_matrices_of_linear_layers_decay(self, make_planner, planner):
-        policy, *_ = make_planner(planner)
+        policy, *_ = make_planner(planner, optimizer_type="adamw")
         decay, no_decay = policy.get_optim_params()
         linear = [m.weight for m in policy.planner.modules() if isinstance(m, torch.nn.Linear)]
         attention = [m.in_proj_weight for m in policy.planner.modules() if isinstance(m, torch.nn.MultiheadAttention)]

@@ -4,7 +4,7 @@ import pytest
 import torch
 from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
-from lerobot.policies import make_policy
+from lerobot.policies import make_policy, make_pre_post_processors
 from torch.utils.data import default_collate
 
 from lerobot_hdp import FREE, HDPConfig, PlanPrompt
@@ -53,6 +53,30 @@ def test_a_state_encoder_with_hidden_units_is_not_linear(make_planner, batch, hi
     far, between = ({key: tensor + shift for key, tensor in near.items()} for shift in (1.0, 0.5))
     encode = policy.planner.encoder
     assert torch.allclose(encode(between), (encode(near) + encode(far)) / 2, atol=1e-5) == is_linear
+
+
+def test_what_hardly_varies_in_the_dataset_is_not_blown_up(dataset, make_planner, batch, tmp_path):
+    """Neither in a new training, nor in one that goes on from a checkpoint, as `lerobot-train` makes its normaliser."""
+    key = "observation.environment_state"
+    stats = dataset.meta.stats[key]
+    raw = {bound: stats[bound].copy() for bound in ("min", "max")}
+    stats["max"][0] = stats["min"][0] + 1e-6
+    _, new, postprocessor = make_planner()
+    for processor in (new, postprocessor):
+        processor.save_pretrained(tmp_path)
+    stats |= {bound: raw[bound].copy() for bound in raw}
+    stats["max"][0] = stats["min"][0] + 1e-6
+    policy, *_ = make_planner()
+    resumed, _ = make_pre_post_processors(
+        policy.config, str(tmp_path), preprocessor_overrides={"normalizer_processor": {"stats": dataset.meta.stats}}
+    )
+    moved = {**batch, key: batch[key].clone()}
+    moved[key][:, :2] += 1e-3
+    for preprocessor in (new, resumed):
+        change = preprocessor(moved)[key] - preprocessor(batch)[key]
+        wide, widest = (raw["max"] - raw["min"])[1], (raw["max"] - raw["min"])[1:].max()
+        torch.testing.assert_close(change[:, 1], torch.full((4,), 2e-3 / wide), rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(change[:, 0], torch.full((4,), 2e-3 / (0.1 * widest)), rtol=1e-3, atol=1e-5)
 
 
 def test_tokens_survive_from_the_dataset_to_the_model_and_back_to_words(make_planner, batch, dataset):

@@ -108,10 +108,10 @@ PRESETS: dict[str, Preset] = {
         starts=100,
         average_last=3,
     ),
-    # What two cores do in minutes a cell: a network of a tenth of the size. Without rotary positions, which became part
-    # of the preset `default` by what docs/ablations.md says of them.
+    # What two cores do in minutes a cell: a network of a tenth of the size. Without rotary positions and Muon, which
+    # became part of the preset `default` by what docs/ablations.md says of them.
     "mini": Preset(
-        policy={"preset": "default", "dtype": "bfloat16", "rotary": False},
+        policy={"preset": "default", "dtype": "bfloat16", "rotary": False, "optimizer_type": "adamw"},
         tasks={
             **_TASKS_2D,
             "xarm_sorting": Training(200, 3_000, 50, _MINI_XARM),
@@ -130,6 +130,7 @@ PRESETS: dict[str, Preset] = {
             "preset": "default",
             "dtype": "bfloat16",
             "rotary": False,
+            "optimizer_type": "adamw",
             "prediction_type": "epsilon",
             "optimizer_lr": 5e-4,
         },
