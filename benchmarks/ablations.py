@@ -40,6 +40,12 @@ CHANGES: dict[str, dict[str, Any]] = {
     "symbol_loss_weight=1/1000": {"symbol_loss_weight": 1 / 1000},
     "rotary=true": {"rotary": True},
     "mask_schedule=cosine": {"mask_schedule": "cosine"},
+    "rotary=true, optimizer_type=muon": {"rotary": True, "optimizer_type": "muon"},
+    "rotary=true, optimizer_type=muon, optimizer_lr=3e-3": {
+        "rotary": True,
+        "optimizer_type": "muon",
+        "optimizer_lr": 3e-3,
+    },
     "ema_max_decay=0": {"ema_max_decay": 0.0},
     "dropout=0.1": {"dropout": 0.1},
     "dropout=0.3": {"dropout": 0.3},

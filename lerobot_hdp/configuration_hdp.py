@@ -1,6 +1,7 @@
 """Everything that can be set about the planner."""
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -36,7 +37,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "observation_weight_std": 0.5,
         "symbol_loss_weight": 1 / 300,
         "optimizer_type": "muon",
-        "optimizer_lr": 1e-3,
+        "optimizer_lr": 3e-3,
         "scheduler_warmup_steps": 100,
         "sampler": "confidence",
         "num_inference_steps": 10,
@@ -251,13 +252,14 @@ class HDPConfig(PreTrainedConfig):
 
     def _token_sizes(self, features: dict[str, dict]) -> list[int]:
         """Sizes of the condition tokens, see `object_tokens`."""
+        lengths = {key: math.prod(feature.shape) for key, feature in self.input_features.items()}
         if not self.object_tokens:
-            return [sum(feature.shape[0] for feature in self.input_features.values())]
+            return [sum(lengths.values())]
         sizes = []
-        for key, feature in self.input_features.items():
+        for key, length in lengths.items():
             names = features[key].get("names")
-            has_objects = key == OBS_ENV_STATE and isinstance(names, list)
-            sizes += object_sizes(names) if has_objects else [feature.shape[0]]
+            names_components = key == OBS_ENV_STATE and isinstance(names, list) and len(names) == length
+            sizes += object_sizes(names) if names_components else [length]
         return sizes
 
     def _set_symbols(self, features: dict[str, dict]) -> None:

@@ -9,10 +9,10 @@ def keep_data_order_on_resume() -> None:
     """Let a resumed run go on in the epoch where it stopped.
 
     `lerobot-train` restores the sampler's epoch, but Accelerate's loader counts its epochs from 0 again and tells the
-    sampler so: after the first epoch, a resumed run sees other data than an uninterrupted one. The difference between
-    what was restored and what the loader says first is added to all that it says from then on.
+    sampler so: after the first epoch, a resumed run sees other data than an uninterrupted one. If what the loader says
+    first is 0, the restored epoch is added to all that it says from then on.
 
-    To be removed with LeRobot pull request 4692, after which that difference is 0.
+    To be removed with LeRobot pull request 4692, after which the loader says the right epoch.
     """
     set_epoch, load_state_dict = EpisodeAwareSampler.set_epoch, EpisodeAwareSampler.load_state_dict
     if getattr(set_epoch, "keeps_data_order", False):
@@ -24,7 +24,7 @@ def keep_data_order_on_resume() -> None:
 
     def set_shifted_epoch(self: EpisodeAwareSampler, epoch: int) -> None:
         if hasattr(self, "_restored_epoch"):
-            self._epoch_shift = self._restored_epoch - epoch
+            self._epoch_shift = self._restored_epoch if epoch == 0 else 0
             del self._restored_epoch
         set_epoch(self, epoch + getattr(self, "_epoch_shift", 0))
 

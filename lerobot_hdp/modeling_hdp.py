@@ -102,6 +102,7 @@ class HDPPolicy(PreTrainedPolicy):
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
         self.register_buffer("forward_calls", torch.tensor(0))
         self._seed_and_calls: tuple[int, int] | None = None
+        self.register_load_state_dict_pre_hook(self._start_average)
         self.reset()
 
     def _make_planner(self) -> Planner:
@@ -130,24 +131,36 @@ class HDPPolicy(PreTrainedPolicy):
             The loss, and its two parts for logging.
         """
         if not self.training:
-            self._warn_of_partial_plans(batch)
-            return self._loss(batch, self._planning_network, None)
+            if self._has_partial_plans(batch):
+                warnings.warn(
+                    "eval_loss says nothing of this planner: it is trained on whole plans, and evaluated in the middle "
+                    "of episodes. Train with hdp-train, or with --policy.plan_from=any_frame.",
+                    stacklevel=2,
+                )
+            # The same noise at every evaluation, so that their losses differ by the weights.
+            return self._loss(batch, self._planning_network, Generator(self._device).manual_seed(0))
+        if self._seed_and_calls is None and self._has_partial_plans(batch):
+            raise ValueError(
+                "there are samples from the middle of episodes, as with --dataset.streaming=true; a planner of whole "
+                "episodes needs --dataset.streaming=false, or --policy.plan_from=any_frame"
+            )
         step = self._next_step()
         generator = Generator(self._device).manual_seed(_seed(*step))
         with torch.random.fork_rng(devices=self._cuda_devices):
             torch.manual_seed(_seed(*step, 1 + _rank_and_world_size()[0]))  # of dropout
             return self._loss(batch, self.planner, generator)
 
-    def _warn_of_partial_plans(self, batch: dict[str, Tensor]) -> None:
-        """LeRobot evaluates the loss at every frame of the held-out episodes; `hdp-train`, where plans begin."""
+    def _has_partial_plans(self, batch: dict[str, Tensor]) -> bool:
+        """Whether a planner of whole episodes is shown samples from the middle of some.
+
+        LeRobot evaluates the loss at every frame of the held-out episodes (`hdp-train`, where plans begin), and
+        streams all frames of a dataset, whatever `drop_n_last_frames` says.
+        """
         is_pad = batch.get(f"{ACTION}_is_pad")
+        if self.config.plan_from != "episode_start" or is_pad is None:
+            return False
         # HD's last segment may end after the horizon, and so hold padding in every sample.
-        if self.config.plan_from == "episode_start" and is_pad is not None and is_pad[:, : self.config.horizon].any():
-            warnings.warn(
-                "eval_loss says nothing of this planner: it is trained on whole plans, and evaluated in the middle of "
-                "episodes. Train with hdp-train, or with --policy.plan_from=any_frame.",
-                stacklevel=2,
-            )
+        return bool(is_pad[:, : self.config.horizon].any())
 
     def _next_step(self) -> tuple[int, int]:
         """Count a training step: `noise_seed` and `forward_calls`.
@@ -174,7 +187,7 @@ class HDPPolicy(PreTrainedPolicy):
         if self.symbol_process is None:
             prediction = network.denoiser(noisy_motion.value, None, observation, k_c, torch.zeros_like(k_c))
             loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
-            return loss, numbers(motion_loss=loss)
+            return loss, read_losses(motion_loss=loss)
 
         if not self.config.shared_level:
             levels = self._sample_levels(self.symbol_process, len(motion), generator)
@@ -185,7 +198,7 @@ class HDPPolicy(PreTrainedPolicy):
         motion_loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
         symbol_loss = self.symbol_process.loss(prediction.symbols, corrupted_symbols).mean()
         loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
-        return loss, numbers(motion_loss=motion_loss, symbol_loss=symbol_loss)
+        return loss, read_losses(motion_loss=motion_loss, symbol_loss=symbol_loss)
 
     def _sample_levels(self, process: Process, batch_size: int, generator: Generator | None) -> Tensor:
         """Levels for the batches of all processes of a distributed run, (processes x B,); see `_corrupt`."""
@@ -231,6 +244,7 @@ class HDPPolicy(PreTrainedPolicy):
             ValueError: an observation with NaN or infinity, a prompt that does not fit, or a checker with nothing to
                 choose from.
         """
+        self.eval()
         k = num_candidates
         if k is None:
             partial = isinstance(prompt, PlanPrompt) and prompt.gives_part_of_motion and self.can_score
@@ -267,6 +281,7 @@ class HDPPolicy(PreTrainedPolicy):
         Raises:
             ValueError: this planner cannot say.
         """
+        self.eval()
         if not self.can_score:
             raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
         processes = self.motion_process, self.symbol_process
@@ -375,7 +390,6 @@ class HDPPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
         """The next action of the plan, after making one if there is none: (B, D)."""
-        self.eval()
         if not self._queue:
             self._queue.extend(self.predict_action_chunk(batch).unbind(dim=1))
         return self._queue.popleft()
@@ -424,6 +438,15 @@ class HDPPolicy(PreTrainedPolicy):
         """The README.md that goes to the Hub with the weights: LeRobot's, and what this planner is."""
         return describe_planner(super().generate_model_card(*args, **kwargs), self.config)
 
+    def _start_average(self, _: nn.Module, state: dict[str, Tensor], prefix: str, *__: Any) -> None:
+        """Let a planner that was saved without averaged weights be trained on with some."""
+        if self.ema is None or any(name.startswith(f"{prefix}ema.") for name in state):
+            return
+        network = f"{prefix}planner."
+        weights = {name.removeprefix(network): value for name, value in state.items() if name.startswith(network)}
+        state |= {f"{prefix}ema.module.{name}": value for name, value in weights.items()}
+        state[f"{prefix}ema.n_averaged"] = torch.zeros_like(self.ema.n_averaged)
+
     @classmethod
     def _load_as_safetensor(cls, model: "HDPPolicy", model_file: str, map_location: str, strict: bool) -> "HDPPolicy":
         """Load the whole checkpoint or none of it: half-loaded weights plan nonsense without a word."""
@@ -431,6 +454,9 @@ class HDPPolicy(PreTrainedPolicy):
             return super()._load_as_safetensor(model, model_file, map_location, strict=True)
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{model_file} is missing from the checkpoint") from error
+        except RuntimeError as error:
+            first = next((line.strip() for line in str(error).splitlines()[1:] if line.strip()), str(error))
+            raise ValueError(f"the settings do not fit the weights in {model_file}: {first}") from error
         except SafetensorError as error:
             raise ValueError(f"{model_file} is damaged or incomplete ({error}); copy the checkpoint again") from error
 
@@ -450,7 +476,7 @@ def make_processes(config: HDPConfig) -> tuple[GaussianProcess, SymbolProcess | 
 
 
 @torch.no_grad()
-def numbers(**losses: Tensor) -> dict[str, float]:
+def read_losses(**losses: Tensor) -> dict[str, float]:
     """Losses () as numbers, for logging. They are read at once: each reading makes the host wait for the device."""
     return dict(zip(losses, torch.stack(list(losses.values())).tolist(), strict=True))
 

@@ -95,7 +95,7 @@ def sample_plan(
     What the prompt gives stays fixed at every step. Given tokens are seen clean; a given action (or one-hot symbol)
     is seen with the noise of the current level, as in training. Where all symbols or the whole motion of a sample are
     given, its k_d or k_c is 0, unless the two share one level. PAD fills the end of a plan only: before a given token,
-    none is drawn.
+    the masked process draws none.
 
     Args:
         denoise: the denoiser, with its observation.

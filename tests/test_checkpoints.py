@@ -10,6 +10,8 @@ from .conftest import REPOSITORY
 
 CHECKPOINTS = sorted(path.parent for path in (REPOSITORY / "checkpoints").glob("*/config.json"))
 
+assert CHECKPOINTS, "the folder of checkpoints is empty"
+
 
 @pytest.mark.parametrize("checkpoint", CHECKPOINTS, ids=lambda path: path.name)
 def test_a_checkpoint_succeeds_on_fresh_starts(checkpoint: Path):

@@ -42,7 +42,9 @@ def test_fused_training_ends_with_the_same_weights(make_planner, batch):
 
 
 def test_unless_told_so_only_cuda_is_fused():
-    optimizer = HDPConfig(preset="paper", device="cpu").get_optimizer_preset().build([torch.nn.Parameter(torch.zeros(2))])
+    optimizer = (
+        HDPConfig(preset="paper", device="cpu").get_optimizer_preset().build([torch.nn.Parameter(torch.zeros(2))])
+    )
     assert not is_fused(optimizer)
 
 
@@ -75,7 +77,9 @@ def muon_for(matrix: torch.nn.Parameter, **options) -> MuonAdamW:
     return config.build(parameter_groups(network, [matrix]))
 
 
-@pytest.mark.parametrize("optimizer_of", [muon_for, lambda matrix, **options: FusedAdamWConfig(**options).build([matrix])])
+@pytest.mark.parametrize(
+    "optimizer_of", [muon_for, lambda matrix, **options: FusedAdamWConfig(**options).build([matrix])]
+)
 def test_a_run_that_goes_on_on_another_device_takes_what_suits_this_one(tmp_path, optimizer_of):
     parameter = torch.nn.Parameter(torch.ones(2, 2))
     there, here = (optimizer_of(parameter, fused=fused) for fused in (False, True))

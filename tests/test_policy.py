@@ -33,6 +33,19 @@ def test_each_object_is_a_condition_token_of_its_own(make_planner):
     assert make_planner(object_tokens=False)[0].config.observation_token_sizes == [7]
 
 
+def test_names_that_are_not_of_components_tell_no_objects(dataset):
+    """LeRobot's own datasets often name a whole vector: `"names": ["keypoints"]`."""
+    features = {**dataset.meta.features}
+    features["observation.environment_state"] = {**features["observation.environment_state"], "names": ["keypoints"]}
+    config = HDPConfig(**TINY_PLANNER, device="cpu")
+    config.input_features = {
+        "observation.environment_state": PolicyFeature(FeatureType.ENV, (4,)),
+        "observation.state": PolicyFeature(FeatureType.STATE, (3,)),
+    }
+    config.set_dataset_feature_metadata(features)
+    assert config.observation_token_sizes == [4, 3]
+
+
 @pytest.mark.parametrize("hidden_dim", [0, 16])
 @pytest.mark.parametrize("object_tokens", [True, False])
 def test_a_plan_depends_on_every_observation(make_planner, batch, object_tokens, hidden_dim):
@@ -222,8 +235,9 @@ def test_an_open_prompt_stays_open_where_it_is_filled(make_planner, batch):
     assert not policy.read_prompt(inputs).not_pad[:, 1:].any()
 
 
-def test_planning_has_no_dropout_even_while_the_policy_trains(make_planner, inputs):
-    policy, *_ = make_planner(dropout=0.5)
+@pytest.mark.parametrize("ema_max_decay", [0.0, 0.9999])
+def test_planning_has_no_dropout_even_while_the_policy_trains(make_planner, inputs, ema_max_decay):
+    policy, *_ = make_planner(dropout=0.5, ema_max_decay=ema_max_decay)
     plans = [policy.train().plan(observation(inputs), generator=torch.Generator().manual_seed(0)) for _ in range(2)]
     assert torch.equal(plans[0].actions, plans[1].actions)
 
@@ -242,6 +256,25 @@ def test_planning_uses_the_moving_average_of_the_weights(make_planner, batch):
         expected = decay * expected + (1 - decay) * weight.detach()
     torch.testing.assert_close(dict(policy.ema.module.named_parameters())[name].detach(), expected)
     assert policy._planning_network is policy.ema.module
+
+
+def test_a_planner_saved_without_averaged_weights_can_be_trained_on_with_some(make_planner, tmp_path):
+    policy, *_ = make_planner(ema_max_decay=0.0)
+    policy.save_pretrained(tmp_path)
+    policy.config.ema_max_decay = 0.99
+    loaded = HDPPolicy.from_pretrained(tmp_path, config=policy.config)
+    assert loaded.ema.n_averaged == 0
+    for name, weight in policy.planner.named_parameters():
+        torch.testing.assert_close(loaded.ema.module.get_parameter(name), weight.detach())
+
+
+def test_a_held_out_loss_depends_on_nothing_but_weights_and_data(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    inputs = preprocessor(batch)
+    losses = [policy.eval().forward(inputs)[0].item() for _ in range(2)]
+    assert losses[0] == losses[1]
+    torch.nn.init.zeros_(policy.ema.module.denoiser.motion_head.weight)
+    assert policy.forward(inputs)[0].item() != losses[0]
 
 
 def test_the_noise_of_a_training_step_does_not_depend_on_the_global_generator(make_planner, batch):
@@ -346,6 +379,22 @@ class TestBadInput:
         step = SymbolicPlanProcessorStep(symbolic_horizon=5, vocabulary_size=3)
         plan = step.observation({OBS_SYMBOLIC_PLAN: torch.zeros(2, 4, dtype=torch.int64, device="meta")})
         assert plan[OBS_SYMBOLIC_PLAN].shape == (2, 5)
+
+    def test_training_samples_from_the_middle_of_an_episode(self, make_planner, dataset):
+        """As `--dataset.streaming=true` gives them, whatever `drop_n_last_frames` says."""
+        middle = default_collate([dataset[1], dataset[2]])
+        policy, preprocessor, _ = make_planner()
+        with pytest.raises(ValueError, match="--dataset.streaming=false"):
+            policy.train().forward(preprocessor(middle))
+        policy, preprocessor, _ = make_planner(plan_from="any_frame")
+        assert policy.train().forward(preprocessor(middle))[0].isfinite()
+
+    def test_settings_that_do_not_fit_the_weights(self, make_planner, tmp_path):
+        policy, *_ = make_planner()
+        policy.save_pretrained(tmp_path)
+        policy.config.num_layers += 1
+        with pytest.raises(ValueError, match=r"the settings do not fit the weights in .*decoder\.layers\.1"):
+            HDPPolicy.from_pretrained(tmp_path, config=policy.config)
 
     def test_a_horizon_that_is_not_the_episodes(self, make_planner):
         message = r"episodes have 19 to 19 frames, the planner's horizon is 20.* --dataset.episodes leaves out count"

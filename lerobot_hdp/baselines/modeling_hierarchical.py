@@ -13,7 +13,7 @@ from torch import Generator, Tensor, nn
 
 from ..denoiser import Denoiser, Prediction
 from ..encoders import StateEncoder
-from ..modeling_hdp import HDPPolicy, numbers
+from ..modeling_hdp import HDPPolicy, read_losses
 from ..plan import Plan, PlanPrompt
 from ..sampling import DenoisingState, Stream, sample_plan
 from .configuration_hierarchical import CoupledHierarchicalDiffuserConfig, HierarchicalDiffuserConfig
@@ -140,7 +140,7 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
         )
         prediction = network.denoise_segments(noisy_segments.value, state, subgoals, noisy_segments.level)
         motion_loss = process.loss(prediction, noisy_segments).mean()
-        return subgoal_loss + motion_loss, numbers(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
+        return subgoal_loss + motion_loss, read_losses(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
 
     def _sample(
         self,
@@ -201,7 +201,7 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
         high, low = self._denoise_both(network, noisy_subgoals.value, noisy_segments.value, state, noisy_subgoals.level)
         subgoal_loss = process.loss(high, noisy_subgoals).mean()
         motion_loss = process.loss(low, noisy_segments).mean()
-        return subgoal_loss + motion_loss, numbers(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
+        return subgoal_loss + motion_loss, read_losses(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
 
     def _denoise_both(
         self, network: HierarchicalPlanner, subgoals: Tensor, segments: Tensor, state: Tensor, level: Tensor

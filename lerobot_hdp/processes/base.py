@@ -82,5 +82,5 @@ class SymbolProcess(Process, Protocol):
 
 
 def expand_to(level: Tensor, value: Tensor) -> Tensor:
-    """Give a level of shape (B,) or () trailing axes, so that it broadcasts against a (B, ...) value."""
+    """Give a tensor trailing axes, so that it broadcasts against a (B, ...) value; a scalar stays one."""
     return level.reshape(level.shape + (1,) * (value.ndim - level.ndim)) if level.ndim else level

@@ -46,13 +46,13 @@ def hold_datasets_in_memory(max_gib: float) -> None:
         nonlocal users_num_workers
         users_num_workers = cfg.num_workers
         train_and_eval = make_datasets(cfg)
-        datasets = [dataset for dataset in train_and_eval if dataset is not None]
+        opened = [dataset for dataset in train_and_eval if dataset is not None]
         # The planners take no images: their cameras need not be decoded.
-        leave_out = datasets[0].meta.camera_keys if isinstance(cfg.policy, HDPConfig) else []
-        if (reason := _why_not_in_memory(datasets, leave_out, max_gib)) is not None:
+        leave_out = opened[0].meta.camera_keys if isinstance(cfg.policy, HDPConfig) else []
+        if (reason := _why_not_in_memory(opened, leave_out, max_gib)) is not None:
             logging.warning("The dataset is read item by item, as by lerobot-train: %s", reason)
             return train_and_eval
-        if all(dataset.image_transforms is None for dataset in datasets):
+        if all(dataset.image_transforms is None for dataset in opened):
             cfg.num_workers = 0  # there is nothing to wait for; image transforms are made sample by sample
         return tuple(None if dataset is None else InMemoryDataset(dataset, leave_out) for dataset in train_and_eval)
 
@@ -105,12 +105,12 @@ def hold_process_group() -> list[ProcessGroup]:
     return held
 
 
-def _why_not_in_memory(datasets: list[LeRobotDataset], leave_out: list[str], max_gib: float) -> str | None:
+def _why_not_in_memory(opened: list[LeRobotDataset], leave_out: list[str], max_gib: float) -> str | None:
     """What keeps datasets from being held in memory together, in words; None: nothing."""
-    for dataset in datasets:
+    for dataset in opened:
         if (reason := unsupported(dataset, leave_out)) is not None:
             return reason
-    needed = sum(memory_needed(dataset, leave_out) for dataset in datasets) / GIB
+    needed = sum(memory_needed(dataset, leave_out) for dataset in opened) / GIB
     return f"it needs {needed:.1f} GiB, more than --max_memory_gib={max_gib:g}" if needed > max_gib else None
 
 
@@ -199,7 +199,10 @@ def main() -> None:
     try:
         lerobot_train.main()
     except OutOfTimeError:
-        logging.info("Out of time after %g minutes. Go on with --resume=true.", options.max_train_minutes)
+        logging.info(
+            "Out of time after %g minutes. Go on with --resume=true. Only a finished training is pushed to the Hub.",
+            options.max_train_minutes,
+        )
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
     gc.collect()  # the model
