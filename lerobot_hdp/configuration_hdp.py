@@ -113,8 +113,8 @@ class HDPConfig(PreTrainedConfig):
         optimizer_type: `muon` updates the matrices between hidden layers by Muon and the rest by AdamW (optimizer.py),
             `adamw` all by AdamW.
         optimizer_*, scheduler_*: of these, with a linear warm-up and a cosine decay to the last step.
-            `optimizer_betas`, `optimizer_eps`: of AdamW; `optimizer_momentum`: of Muon; `optimizer_fused`: AdamW updates
-            all parameters in one kernel; None: on CUDA.
+            `optimizer_betas`, `optimizer_eps`: of AdamW; `optimizer_momentum`: of Muon; `optimizer_fused`: AdamW
+            updates all parameters in one kernel; None: on CUDA.
 
     Raises:
         ParsingError: a value that cannot be. It is draccus' own error, because LeRobot's commands hide the message of

@@ -384,7 +384,7 @@ class TestBadInput:
         """As `--dataset.streaming=true` gives them, whatever `drop_n_last_frames` says."""
         middle = default_collate([dataset[1], dataset[2]])
         policy, preprocessor, _ = make_planner()
-        with pytest.raises(ValueError, match="--dataset.streaming=false"):
+        with pytest.raises(ValueError, match=r"--dataset\.streaming=false"):
             policy.train().forward(preprocessor(middle))
         policy, preprocessor, _ = make_planner(plan_from="any_frame")
         assert policy.train().forward(preprocessor(middle))[0].isfinite()
