@@ -21,7 +21,14 @@ from typing import Any
 import mujoco
 from tqdm import tqdm
 
-from dataset_tools.record import EPISODES_PER_SHARD, RecordConfig, RecordDatasetConfig, Shard, record_shard
+from dataset_tools.record import (
+    EPISODES_PER_SHARD,
+    RecordConfig,
+    RecordDatasetConfig,
+    Shard,
+    record_shard,
+    shard_starts,
+)
 from gym_hdp_tasks.env_config import HDPEnv
 
 from .machine import RESULTS, describe_run
@@ -87,6 +94,9 @@ def main() -> None:
     parser.add_argument("--num_camera_episodes", type=int, default=50, help="with cameras")
     parser.add_argument("--num_workers", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()
+    for num_episodes in (options.num_episodes, options.num_camera_episodes):
+        if len(shard_starts(num_episodes)) < options.num_workers:
+            parser.error(f"{num_episodes} episodes do not keep {options.num_workers} workers busy")
     result: dict[str, Any] = {"run": describe_run()}
     for obs_type, num_episodes in (("state", options.num_episodes), ("pixels_state", options.num_camera_episodes)):
         shares = time_shares(obs_type, min(num_episodes, EPISODES_PER_SHARD))

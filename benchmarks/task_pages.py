@@ -1,5 +1,7 @@
 """Write what `benchmarks/results/` says into the pages of `docs/tasks/`, below their heading `## Measured`.
 
+Below each table stands where its figures come from: each command, with the commit at which it was run.
+
 python -m benchmarks.task_pages
 """
 
@@ -29,8 +31,7 @@ def expert_table(task: str) -> str:
     replay = load("replay").get(f"{task}-v0")
     counts = own["plans"].values()
     rows = {
-        "successes": f'{successes(own)}; with `robot="menagerie"` {successes(menagerie)} '
-        f"(commit {menagerie['run']['git_commit']})",
+        "successes": f'{successes(own)}; with `robot="menagerie"` {successes(menagerie)}',
         "clipped actions": own["clipped_actions"],
         "plans": f"{len(counts)} different ones, each chosen {min(counts)} to {max(counts)} times "
         f"([counts](../../benchmarks/results/expert_{task}.json))",
@@ -42,12 +43,7 @@ def expert_table(task: str) -> str:
             f"{replay['same_score']} of {replay['num_episodes']}"
         )
     lines = [f"| {task} | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())]
-    commands = [
-        f"python -m benchmarks.experts --tasks {own['task']} --num_episodes {own['num_episodes']}",
-        *(["python -m benchmarks.replay"] if replay else []),
-    ]
-    table = "\n".join(lines)
-    return f"{machine(own)}{table}\n\n{', '.join(f'`{command}`' for command in commands)}\n"
+    return "\n".join([*lines, "", sources(own, menagerie, *([replay] if replay else []))])
 
 
 def successes(result: dict) -> str:
@@ -55,10 +51,11 @@ def successes(result: dict) -> str:
     return f"{total - len(result['failures'])} of {total} seeded starts"
 
 
-def machine(result: dict) -> str:
-    """Where a result comes from, as a paragraph."""
-    run = result["run"]
-    return f"Measured on {run['cores']} cores ({run['cpu']}) at commit {run['git_commit']}.\n\n"
+def sources(*results: dict) -> str:
+    """Where results come from, as a list, each command once."""
+    runs = [result["run"] for result in results]
+    lines = [f"- `{run['command']}`, commit {run['git_commit']}, {run['cores']} cores ({run['cpu']})" for run in runs]
+    return "\n".join(dict.fromkeys(lines)) + "\n"
 
 
 def open_loop_table() -> str:
@@ -75,8 +72,7 @@ def open_loop_table() -> str:
         lines.append(f"| {task} | {speeds} | {result['plans_per_second']['execute_plans'] / bare / num_cores:.2f} |")
     agree = all(result["scores_agree"] for result in results.values())
     lines += ["", f"{num_plans} plans on {num_cores} cores; all scores agree: {agree}."]
-    lines += ["", f"`python -m benchmarks.open_loop --num_plans {num_plans}`", ""]
-    return machine(any_result) + "\n".join(lines)
+    return "\n".join([*lines, "", sources(*results.values())])
 
 
 def recording_table() -> str:
@@ -97,8 +93,7 @@ def recording_table() -> str:
         )
     workers = results["state"]["num_workers"]
     lines += ["", f"{workers} workers, start-up included; the shares are those of one worker."]
-    lines += ["", f"`{results['run']['command']}`", ""]
-    return "\n" + machine(results) + "\n".join(lines)
+    return "\n".join(["", *lines, "", sources(results)])
 
 
 def replace_measured(page: str, text: str) -> None:

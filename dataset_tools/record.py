@@ -23,13 +23,25 @@ import datasets
 import gymnasium as gym
 import numpy as np
 from draccus.utils import ParsingError
+from huggingface_hub import get_token
 from lerobot.configs import parser
 from lerobot.datasets import dataset_writer
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.io_utils import load_info, write_info
+from lerobot.datasets.language import language_feature_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import create_lerobot_dataset_card
-from lerobot.utils.constants import ACTION, DONE, HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE, REWARD, SUCCESS
+from lerobot.datasets.utils import INFO_PATH, create_lerobot_dataset_card
+from lerobot.utils.constants import (
+    ACTION,
+    DEFAULT_FEATURES,
+    DONE,
+    HF_LEROBOT_HOME,
+    OBS_ENV_STATE,
+    OBS_IMAGES,
+    OBS_STATE,
+    REWARD,
+    SUCCESS,
+)
 from tqdm import tqdm
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
@@ -42,6 +54,9 @@ from .interruption import deferred_signals, end_with_parent, exit_when_terminate
 from .language import SYMBOLIC_PLAN, write_language_columns
 
 EPISODES_PER_SHARD = 25
+"""At most. A short recording has smaller shards, ..."""
+FEWEST_SHARDS = 8
+"""... at least so many, so that all processes have work."""
 
 
 @dataclass
@@ -78,7 +93,10 @@ class RecordConfig:
         env: the task, as for `lerobot-eval`; `--env.obs_type=pixels_state` records its cameras too.
         seed: every start and every choice of the expert follow from it.
         num_workers: processes that record.
-        resume: go on with a recording that was interrupted.
+        resume: go on with a recording that was interrupted, or whose upload failed.
+
+    Raises:
+        ParsingError: a number is too small, or there is no login for the upload.
     """
 
     dataset: RecordDatasetConfig
@@ -90,18 +108,23 @@ class RecordConfig:
     def __post_init__(self):
         if self.dataset.num_episodes < 1 or self.num_workers < 1:
             raise ParsingError("--dataset.num_episodes and --num_workers must be at least 1")
+        if self.dataset.push_to_hub and get_token() is None:
+            raise ParsingError("--dataset.push_to_hub=true needs a login: run `hf auth login` first")
 
     @property
     def root(self) -> Path:
         return Path(self.dataset.root or HF_LEROBOT_HOME / self.dataset.repo_id)
+
+    @property
+    def partial_root(self) -> Path:
+        """Folder of the shards, until they are merged."""
+        return self.root.with_name(self.root.name + ".partial")
 
 
 class Episode(NamedTuple):
     """A demonstration as it was executed; the arrays have one row for each frame."""
 
     columns: dict[str, np.ndarray]
-    symbols: list[str]
-    score: float
 
     @property
     def succeeded(self) -> bool:
@@ -143,7 +166,7 @@ def demonstrate(env: gym.Env, expert: Expert, seed: int, features_map: dict[str,
     observation, _ = env.reset(seed=seed)
     demonstration = expert(env, expert_generator(seed))
     task: PlanningTask = env.unwrapped.planning_task  # type: ignore[attr-defined]
-    frames, score = [], 0.0
+    frames = []
     for frame, action in enumerate(demonstration.waypoints):
         next_observation, score, terminated, truncated, info = env.step(action)
         frames.append(
@@ -158,7 +181,7 @@ def demonstrate(env: gym.Env, expert: Expert, seed: int, features_map: dict[str,
         )
         observation = next_observation
     columns = {key: np.stack([frame[key] for frame in frames]) for key in frames[0]}
-    return Episode(columns, demonstration.remaining_symbols(0), float(score))
+    return Episode(columns)
 
 
 def _entry(observation: dict[str, Any], key: str) -> np.ndarray:
@@ -323,7 +346,10 @@ def record(config: RecordConfig) -> LeRobotDataset:
     Raises:
         FileExistsError: the dataset's folder exists, or an interrupted recording does and `resume` is not set.
         ValueError: the environment cannot be made, or the interrupted recording had other settings.
+        OSError: the upload failed.
     """
+    if (dataset := finish_earlier_recording(config)) is not None:
+        return dataset
     try_environment(config)
     shards = plan_shards(config)
     with tqdm(total=config.dataset.num_episodes, desc="Recording", unit="episode") as progress:
@@ -357,13 +383,67 @@ def merge_shards(config: RecordConfig, shards: list[Shard]) -> LeRobotDataset:
     print(
         f"{dataset.num_episodes} episodes in {config.root}; dropped {dropped} of {attempts} demonstrations that failed"
     )
-    if config.dataset.push_to_hub:
+    _upload_if_wanted(config, dataset)
+    return dataset
+
+
+def _upload_if_wanted(config: RecordConfig, dataset: LeRobotDataset) -> None:
+    if not config.dataset.push_to_hub:
+        return
+    try:
         dataset.push_to_hub(
             tags=[*CARD_TAGS, *config.dataset.tags],
             private=config.dataset.private,
             dataset_description=describe(config.env.planning_task, dataset),
         )
+    except Exception as error:  # of the Hub's client, of HTTP, of the transfer: nothing is lost by any
+        reason = " ".join(str(error).split())
+        raise OSError(
+            f"{config.root} is complete, but the upload failed; the command with --resume=true repeats it ({reason})"
+        ) from error
+
+
+def finish_earlier_recording(config: RecordConfig) -> LeRobotDataset | None:
+    """The dataset, if it is there and `resume` is set: do what its recording had left to do, the upload in particular.
+
+    Raises:
+        FileExistsError: the dataset's folder exists, but `resume` is not set, or it holds something else.
+        OSError: the upload failed.
+    """
+    if not config.root.exists():
+        return None
+    complete = _is_complete_dataset(config)
+    if not config.resume:
+        unfinished = complete and (config.dataset.push_to_hub or config.partial_root.exists())
+        advice = "finish it with --resume=true" if unfinished else "delete it"
+        raise FileExistsError(f"{config.root} exists already: {advice}, or choose another --dataset.root")
+    if not complete:
+        raise FileExistsError(
+            f"{config.root} exists already and holds something else: to resume, use the flags that recorded it, or "
+            "choose another --dataset.root"
+        )
+    shutil.rmtree(config.partial_root, ignore_errors=True)
+    dataset = LeRobotDataset(config.dataset.repo_id, root=config.root, video_backend="pyav")
+    print(f"{dataset.num_episodes} episodes in {config.root}, recorded earlier")
+    _upload_if_wanted(config, dataset)
     return dataset
+
+
+def _is_complete_dataset(config: RecordConfig) -> bool:
+    """Whether the dataset's folder holds what the configuration asks for."""
+    if not (config.root / INFO_PATH).exists():
+        return False
+
+    def columns(features: dict[str, dict[str, Any]]) -> dict[str, tuple]:
+        own = features.keys() - DEFAULT_FEATURES.keys()
+        return {name: (features[name]["dtype"], tuple(features[name]["shape"])) for name in own}
+
+    info, wanted = load_info(config.root), dataset_features(config)
+    language = language_feature_info() if config.dataset.language else {}
+    if info.total_episodes != config.dataset.num_episodes or columns(info.features) != columns({**wanted, **language}):
+        return False
+    explanation = info.features[SYMBOLIC_PLAN].get("info") or {}
+    return {**explanation, **wanted[SYMBOLIC_PLAN]["info"]} == explanation
 
 
 def try_environment(config: RecordConfig) -> None:
@@ -385,9 +465,7 @@ def try_environment(config: RecordConfig) -> None:
 
 def plan_shards(config: RecordConfig) -> list[Shard]:
     """The shards of a recording, in a folder beside the dataset's that remembers the settings."""
-    partial = config.root.with_name(config.root.name + ".partial")
-    if config.root.exists():
-        raise FileExistsError(f"{config.root} exists already: delete it, or choose another --dataset.root")
+    partial = config.partial_root
     settings = {
         "env": asdict(config.env),
         "seed": config.seed,
@@ -403,8 +481,15 @@ def plan_shards(config: RecordConfig) -> list[Shard]:
     partial.mkdir(parents=True, exist_ok=True)
     settings_file.write_text(json.dumps(settings, indent=2))
     total = config.dataset.num_episodes
-    starts = range(0, total, EPISODES_PER_SHARD)
-    return [Shard(partial / f"episodes_{start:06d}", start, min(start + EPISODES_PER_SHARD, total)) for start in starts]
+    starts = shard_starts(total)
+    if len(starts) < config.num_workers:
+        logging.warning(f"only {len(starts)} of {config.num_workers} workers have work: {total} episodes are few")
+    return [Shard(partial / f"episodes_{start:06d}", start, min(start + starts.step, total)) for start in starts]
+
+
+def shard_starts(num_episodes: int) -> range:
+    """The first episodes of the shards; they do not depend on the number of processes, nor may the dataset."""
+    return range(0, num_episodes, min(EPISODES_PER_SHARD, max(1, num_episodes // FEWEST_SHARDS)))
 
 
 def is_complete(shard: Shard) -> bool:
@@ -418,8 +503,7 @@ def failed_attempts(shard: Shard) -> dict[int, int]:
 
 
 def _merge(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) -> LeRobotDataset:
-    partial = shards[0].root.parent
-    merged = partial / "merged"
+    merged = config.partial_root / "merged"
     shutil.rmtree(merged, ignore_errors=True)
     repo_id = config.dataset.repo_id
     aggregate_datasets([repo_id] * len(shards), repo_id, roots=[shard.root for shard in shards], aggr_root=merged)
@@ -439,7 +523,7 @@ def _merge(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) ->
     card.save(merged / "README.md")
     config.root.parent.mkdir(parents=True, exist_ok=True)
     merged.rename(config.root)
-    shutil.rmtree(partial)
+    shutil.rmtree(config.partial_root)
     return LeRobotDataset(repo_id, root=config.root, video_backend="pyav")
 
 

@@ -4,10 +4,10 @@
         --dataset.repo_id=me/xarm_tool_use --dataset.root=/shared/xarm_tool_use \\
         --num_workers=40 --slurm.partition=cpu
 
-Takes all flags of `hdp-record`; the dataset that comes out is the same. A shard is 25 episodes, each with a seed of its
-own, so that it does not matter which machine records it. When all are done, one more task merges them with LeRobot's
-`aggregate_datasets`. When a job has failed or was stopped, the same command goes on with it. The dataset's folder
-must be one that all machines see; the engine's logs are written beside it. Needs the extra `cluster`:
+Takes all flags of `hdp-record`; the dataset that comes out is the same. A shard is up to 25 episodes, each with a seed
+of its own, so that it does not matter which machine records it. When all are done, one more task merges them with
+LeRobot's `aggregate_datasets`. When a job has failed or was stopped, the same command goes on with it. The dataset's
+folder must be one that all machines see; the engine's logs are written beside it. Needs the extra `cluster`:
 `pip install '.[cluster]'` in a clone.
 """
 
@@ -22,7 +22,15 @@ from datatrove.executor import LocalPipelineExecutor, SlurmPipelineExecutor
 from draccus.utils import ParsingError
 from lerobot.configs import parser
 
-from .record import RecordConfig, Shard, merge_shards, plan_shards, record_shard, try_environment
+from .record import (
+    RecordConfig,
+    Shard,
+    finish_earlier_recording,
+    merge_shards,
+    plan_shards,
+    record_shard,
+    try_environment,
+)
 
 
 @dataclass
@@ -63,9 +71,12 @@ def record_on_cluster(config: ClusterRecordConfig) -> None:
     """Record, or submit the jobs that do.
 
     Raises:
-        FileExistsError: the dataset's folder exists.
+        FileExistsError: the dataset's folder exists, and holds something else.
         ValueError: the environment cannot be made, or the interrupted recording had other settings.
+        OSError: the upload of a dataset that was recorded earlier failed.
     """
+    if finish_earlier_recording(config) is not None:
+        return
     try_environment(config)
     shards = plan_shards(config)
     logs = config.root.with_name(config.root.name + ".logs")

@@ -12,8 +12,9 @@ if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get(
 
 __all__ = ["PAD", "PlanningTask"]
 
-gym.register(id="hdp/BlockSorting2D-v0", entry_point="gym_hdp_tasks.block_sorting_2d:BlockSorting2DEnv")
-gym.register(id="hdp/XArmSorting-v0", entry_point="gym_hdp_tasks.xarm_sorting:XArmSortingEnv")
-gym.register(id="hdp/XArmArrangeBlocks-v0", entry_point="gym_hdp_tasks.xarm_arrange_blocks:XArmArrangeBlocksEnv")
-gym.register(id="hdp/XArmToolUse-v0", entry_point="gym_hdp_tasks.xarm_tool_use:XArmToolUseEnv")
-gym.register(id="hdp/XArmToolUseRedOnTop-v0", entry_point="gym_hdp_tasks.xarm_tool_use:XArmToolUseRedOnTopEnv")
+# An episode of sorting in the plane is as long as its parameters say, so that no length is registered.
+gym.register("hdp/BlockSorting2D-v0", "gym_hdp_tasks.block_sorting_2d:BlockSorting2DEnv")
+gym.register("hdp/XArmSorting-v0", "gym_hdp_tasks.xarm_sorting:XArmSortingEnv", max_episode_steps=145)
+gym.register("hdp/XArmArrangeBlocks-v0", "gym_hdp_tasks.xarm_arrange_blocks:XArmArrangeBlocksEnv", max_episode_steps=25)
+gym.register("hdp/XArmToolUse-v0", "gym_hdp_tasks.xarm_tool_use:XArmToolUseEnv", max_episode_steps=61)
+gym.register("hdp/XArmToolUseRedOnTop-v0", "gym_hdp_tasks.xarm_tool_use:XArmToolUseRedOnTopEnv", max_episode_steps=61)

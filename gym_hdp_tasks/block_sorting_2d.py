@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from .plan_rules import Observation, check_sorting_plan, slots_of_blocks
-from .task import PAD, PlanningTask, equal_steps
+from .task import PAD, PlanningTask, equal_steps, refuse_unknown_options
 
 # All lengths in metres.
 SLOT_SPACING = 0.15
@@ -127,7 +127,7 @@ class BlockSorting2DEnv(gym.Env):
         self.action_high = np.array([*reach, 1.0], np.float32)
         self.action_space = gym.spaces.Box(self.action_low, self.action_high, dtype=np.float32)
         self.observation_space = gym.spaces.Dict(
-            agent_pos=self.action_space,
+            agent_pos=gym.spaces.Box(self.action_low, self.action_high, dtype=np.float32),
             environment_state=gym.spaces.Box(
                 np.tile(-reach, n_blocks).astype(np.float32), np.tile(reach, n_blocks).astype(np.float32)
             ),
@@ -144,7 +144,11 @@ class BlockSorting2DEnv(gym.Env):
         Args:
             seed: seeds the environment's random generator.
             options: `{"order": [...]}` fixes the order: `order[slot]` is the block that starts in that slot.
+
+        Raises:
+            ValueError: the order is no permutation of the blocks, or there is another option.
         """
+        refuse_unknown_options(options, ["order"])
         super().reset(seed=seed)
         order: np.ndarray = np.arange(self.n_blocks)
         while np.array_equal(order, np.arange(self.n_blocks)):

@@ -1,7 +1,7 @@
 """`--env.type=hdp`: LeRobot's view of the tasks."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from draccus.utils import ParsingError
@@ -24,6 +24,9 @@ TASKS: dict[str, Callable[..., PlanningTask]] = {
     "XArmToolUseRedOnTop-v0": xarm_tool_use_red_on_top_task,
 }
 """Task name, as in `--env.task=`, to the function that states the task's facts."""
+BLOCK_SORTING_2D_ONLY = ("n_blocks", "waypoints_per_pose")
+XARM_ONLY = ("robot", "obs_type", "camera_height", "camera_width")
+"""Fields of `HDPEnv` that not every task has."""
 
 
 @EnvConfig.register_subclass("hdp")
@@ -40,6 +43,10 @@ class HDPEnv(EnvConfig):
         obs_type: `state`, `pixels` or `pixels_state` (X-Arm tasks only).
         camera_height: of an observed image, in pixels (X-Arm tasks only).
         camera_width: likewise.
+        fps: actions per second, which the task decides.
+
+    Raises:
+        ParsingError: there is no such task, or it cannot have a value that is not the default.
     """
 
     task: str | None = "BlockSorting2D-v0"
@@ -49,6 +56,7 @@ class HDPEnv(EnvConfig):
     obs_type: str = "state"
     camera_height: int = 128
     camera_width: int = 128
+    fps: int = EnvConfig.fps
     render_mode: str = "rgb_array"
 
     def __post_init__(self):
@@ -56,9 +64,14 @@ class HDPEnv(EnvConfig):
             task = self.planning_task
         except ValueError as error:  # LeRobot's commands show the message of draccus' own error only
             raise ParsingError(str(error)) from error
-        obs_types = OBS_TYPES if self._is_xarm else ("state",)
-        if self.obs_type not in obs_types:
-            raise ParsingError(f"--env.obs_type of {self.task} must be one of {obs_types}, got {self.obs_type!r}")
+        if self.obs_type not in OBS_TYPES:
+            raise ParsingError(f"--env.obs_type must be one of {OBS_TYPES}, got {self.obs_type!r}")
+        others = BLOCK_SORTING_2D_ONLY if self._is_xarm else XARM_ONLY
+        for field in fields(self):
+            if field.name in others and getattr(self, field.name) != field.default:
+                raise ParsingError(f"--env.{field.name} must be left out, {self.task} does not have it")
+        if self.fps not in (EnvConfig.fps, task.fps):
+            raise ParsingError(f"--env.fps must be left out, it is {task.fps} for {self.task}")
         self.fps = task.fps
         self.features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(task.action_names),))}
         self.features_map = {ACTION: ACTION}

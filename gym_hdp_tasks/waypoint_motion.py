@@ -26,9 +26,10 @@ _GRIPPER_DOWN = mink.SO3.from_matrix(np.diag([-1.0, 1.0, -1.0]))
 class WaypointMotion:
     """Turns waypoints into actuator controls, one control period at a time.
 
-    Between two waypoints the tool moves straight and rests at each end: a parabola in joint space, through the
-    inverse kinematics of the half-way point, keeps within 3 mm of the line over 20 cm. Where that would exceed the
-    joints' speed limit, the arm stops short on the line.
+    Between two waypoints the tool is commanded to move straight and to rest at each end: a parabola in joint space,
+    through the inverse kinematics of the half-way point, keeps within 3 mm of the line over 20 cm. Where that would
+    exceed the joints' speed limit, the command stops short on the line. The arm follows as far as its torque limits,
+    which are not looked at here, allow.
 
     Args:
         robot_model: the robot alone, for kinematics.

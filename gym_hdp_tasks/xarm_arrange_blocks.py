@@ -49,7 +49,10 @@ def xarm_arrange_blocks_task(robot: str = "primitive") -> PlanningTask:
 
 
 def check_plan(symbols: Sequence[str], observation: Observation) -> list[str]:
-    """What is wrong with a plan: PICK block PLACE block slot, each slot gets a block, and none is in the way."""
+    """What is wrong with a plan: PICK block PLACE block slot, each slot gets a block, and at each slot there is room.
+
+    Room for the open gripper beside the other blocks (`clear`); one outside the slot may take it, too.
+    """
     where = observation["environment_state"].reshape(len(BLOCKS), len(POSE_NAMES))[:, :2].copy()
     moves, complaints = read_moves(symbols, (["PICK"], BLOCKS, ["PLACE"], BLOCKS, SLOTS))
     for number, (_, block, _, placed, slot) in enumerate(moves, start=1):
@@ -57,7 +60,7 @@ def check_plan(symbols: Sequence[str], observation: Observation) -> list[str]:
             complaints.append(f"move {number} picks {block}, but places {placed}")
         centre = SLOT_CENTRES[SLOTS.index(slot)]
         complaints += [
-            f"move {number} places {placed} in {slot}, where {other} is in the way"
+            f"move {number} places {placed} in {slot}, where {other} leaves no room for the open gripper"
             for other, position in zip(BLOCKS, where, strict=True)
             if other != placed and not clear(centre, position[None])
         ]

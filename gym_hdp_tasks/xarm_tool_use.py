@@ -26,7 +26,7 @@ LANES = np.array([-0.16, 0.0, 0.16])
 LANE_OFFSET = 0.015
 """... give or take this, ..."""
 BLOCK_START_X = (0.70, 0.76)
-"""... and at an x in this interval: 13 cm and more beyond the fingers of an arm at the end of its workspace."""
+"""... and at an x in this interval: the nearest side of a block is 13 cm and more beyond the workspace of the tool."""
 HOOK_START_LOW, HOOK_START_HIGH = np.array([0.29, -0.31]), np.array([0.33, -0.29])
 """The hook's handle starts in this rectangle, the shaft along x."""
 

@@ -37,7 +37,9 @@ def put(env, block, position):
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("n_blocks", [2, 3, 8])
 def test_passes_gymnasiums_checker(n_blocks):
-    check_env(make(n_blocks, render_mode="rgb_array").unwrapped)
+    env = make(n_blocks, render_mode="rgb_array").unwrapped
+    check_env(env)
+    assert env.observation_space["agent_pos"] is not env.action_space
 
 
 def test_starts_are_a_function_of_the_seed():

@@ -64,7 +64,7 @@ def test_what_is_wrong_with_a_plan_that_arranges():
     plan = EXPERTS["hdp/XArmArrangeBlocks-v0"](env, expert_generator(0)).remaining_symbols(0)
     twice = [*plan[:-1], plan[4]]
     found = task.check_plan(twice, observation)
-    assert f"move 3 places {plan[13]} in {plan[4]}, where {plan[3]} is in the way" in found
+    assert f"move 3 places {plan[13]} in {plan[4]}, where {plan[3]} leaves no room for the open gripper" in found
     assert found[-1].startswith("no block ends in S")
     assert task.check_plan(plan[:10], observation) != []
 

@@ -12,11 +12,13 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from draccus.utils import ParsingError
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from dataset_tools import record as recorder
 from dataset_tools.experts import EXPERTS
-from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
+from dataset_tools.record import RecordConfig, RecordDatasetConfig, plan_shards, record, shard_starts
 from dataset_tools.replay import load_recording, replay
 from gym_hdp_tasks.env_config import HDPEnv
 
@@ -105,6 +107,13 @@ def test_a_cluster_engine_records_the_same_dataset(dataset_root, tmp_path):
     assert not root.with_name("cluster.partial").exists()
 
 
+def test_all_workers_have_work_in_a_short_recording_or_the_command_says_so(tmp_path, caplog):
+    assert all(len(shard_starts(n)) >= min(n, 8) for n in range(1, 500))
+    config = RecordConfig(RecordDatasetConfig("test/few", tmp_path / "few", num_episodes=3), num_workers=4)
+    assert len(plan_shards(config)) == 3
+    assert [record.message for record in caplog.records] == ["only 3 of 4 workers have work: 3 episodes are few"]
+
+
 def flags_of_80(root: Path) -> tuple[str, ...]:
     return (*TASK_FLAGS, "--dataset.repo_id=t/t", f"--dataset.root={root}", "--dataset.num_episodes=80")
 
@@ -140,7 +149,7 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_pa
     shards = [done.with_suffix("") for done in first_shard_done.parent.glob("*.done")]
     if signal_number != signal.SIGKILL:
         assert {path for path in first_shard_done.parent.iterdir() if path.is_dir()} == set(shards), "a shard is lost"
-    assert load_info(first_shard_done.with_suffix("")).total_episodes == 25
+    assert load_info(first_shard_done.with_suffix("")).total_episodes == 10
     assert sum(load_info(shard).total_episodes for shard in shards) < 80
 
     refused = run_command("hdp-record", *flags, check=False)
@@ -153,6 +162,7 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_pa
 
 
 def test_ctrl_c_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder, "FEWEST_SHARDS", 1)
     config = RecordConfig(
         dataset=RecordDatasetConfig(repo_id="test/stopped", root=tmp_path / "stopped", num_episodes=5),
         env=HDPEnv(n_blocks=2, waypoints_per_pose=1),
@@ -170,6 +180,64 @@ def test_ctrl_c_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch):
             record(config)
     assert load_info(tmp_path / "stopped.partial/episodes_000000").total_episodes == 3
     assert record(replace(config, resume=True)).num_episodes == 5
+
+
+@pytest.fixture
+def to_upload(tmp_path, monkeypatch) -> RecordConfig:
+    """A recording of two episodes that is to be uploaded; there is a login."""
+    monkeypatch.setattr(recorder, "get_token", lambda: "token")
+    dataset = RecordDatasetConfig("test/uploaded", tmp_path / "uploaded", num_episodes=2, push_to_hub=True)
+    return RecordConfig(dataset, HDPEnv(n_blocks=2, waypoints_per_pose=1))
+
+
+def test_an_upload_without_a_login_is_refused_before_anything_is_recorded(to_upload, monkeypatch):
+    monkeypatch.setattr(recorder, "get_token", lambda: None)
+    with pytest.raises(ParsingError, match="hf auth login"):
+        replace(to_upload)
+
+
+def test_a_failed_upload_is_tried_again_on_what_was_recorded(to_upload, monkeypatch):
+    uploads = []
+
+    def upload(dataset, **_):
+        uploads.append(dataset.num_episodes)
+        if len(uploads) == 1:
+            raise RuntimeError("no network\n\ntry later")
+
+    monkeypatch.setattr(LeRobotDataset, "push_to_hub", upload)
+    with pytest.raises(OSError, match=r"with --resume=true repeats it \(no network try later\)"):
+        record(to_upload)
+    with pytest.raises(FileExistsError, match="finish it with --resume=true"):
+        record(to_upload)
+    monkeypatch.setattr(recorder, "demonstrate", None)
+    assert record(replace(to_upload, resume=True)).num_episodes == 2
+    assert uploads == [2, 2]
+
+
+def test_a_recording_that_was_killed_after_its_last_step_but_one_is_finished(to_upload):
+    config = replace(to_upload, dataset=replace(to_upload.dataset, push_to_hub=False))
+    record(config)
+    with pytest.raises(FileExistsError, match="delete it"):
+        record(config)
+    config.partial_root.mkdir()  # the last step removes it
+    with pytest.raises(FileExistsError, match="finish it with --resume=true"):
+        record(config)
+    assert record(replace(config, resume=True)).num_episodes == 2
+    assert not config.partial_root.exists()
+
+
+def test_another_recording_is_not_taken_for_this_one(to_upload):
+    dataset = replace(to_upload.dataset, push_to_hub=False)
+    config = replace(to_upload, dataset=dataset, resume=True)
+    record(config)
+    for other in (
+        replace(config, seed=1),
+        replace(config, env=HDPEnv(n_blocks=3)),
+        replace(config, dataset=replace(dataset, num_episodes=3)),
+        replace(config, dataset=replace(dataset, language=True)),
+    ):
+        with pytest.raises(FileExistsError, match="holds something else"):
+            record(other)
 
 
 def test_failed_demonstrations_are_dropped_and_counted(tmp_path, monkeypatch, capsys):

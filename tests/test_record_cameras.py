@@ -83,7 +83,7 @@ def test_images_can_be_kept_without_loss(tmp_path):
 
 
 def test_neither_the_number_of_processes_nor_an_interruption_changes_a_frame(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorder, "EPISODES_PER_SHARD", 2)
+    monkeypatch.setattr(recorder, "FEWEST_SHARDS", 2)
     whole = record(config(tmp_path / "two_processes", ARRANGE, num_episodes=4, num_workers=2))
 
     expert, calls = EXPERTS[ARRANGE.gym_id], itertools.count()
@@ -135,7 +135,7 @@ def test_language_columns_say_which_step_is_being_done(dataset):
 
 
 def test_cameras_that_a_task_cannot_have_are_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(ParsingError, match="must be one of"):
+    with pytest.raises(ParsingError, match="does not have it"):
         HDPEnv(task="BlockSorting2D-v0", obs_type="pixels")
     without_pixels = HDPEnv(task="XArmSorting-v0", obs_type="pixels", camera_height=0)
     with pytest.raises(ValueError, match="at least 1 pixel"):

@@ -1,6 +1,7 @@
 """What all X-Arm environments promise, in real physics."""
 
 import os
+from dataclasses import asdict
 from importlib.util import find_spec
 
 import gymnasium as gym
@@ -8,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from draccus.utils import ParsingError
 from gymnasium.utils.env_checker import check_env
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
@@ -74,6 +76,7 @@ def test_an_episode_lasts_its_horizon_and_pays_at_its_end(gym_id):
     assert all(reward == 0 for _, reward, *_ in steps[:-1])
     assert not any(terminated or info["is_success"] for _, _, terminated, _, info in steps)
     assert set(info) == set(steps[-1][-1])
+    assert gym.spec(gym_id).max_episode_steps == horizon
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -90,18 +93,31 @@ def test_the_tool_ends_a_waypoint_within_1_mm(gym_id, stride, robot):
         assert np.linalg.norm(env.tool_position() - waypoint) < 0.001
 
 
-def test_the_tool_moves_straight():
-    env = make("hdp/XArmSorting-v0")
+@pytest.mark.parametrize(
+    ("gym_id", "axis", "length", "tolerance"),
+    [
+        ("hdp/XArmSorting-v0", 0, 0.06, 0.003),
+        ("hdp/XArmSorting-v0", 1, 0.2, 0.003),
+        ("hdp/XArmArrangeBlocks-v0", 0, 0.2, 0.002),
+    ],
+)
+def test_the_tool_moves_straight(gym_id, axis, length, tolerance):
+    env = make(gym_id)
     env.reset(seed=0)
-    start, end = np.array([0.42, -0.1, 0.12]), np.array([0.42, 0.0, 0.12])
-    for _ in range(10):
+    start = np.array([0.39, 0.0, 0.12])
+    start[axis] -= length / 2
+    end = start.copy()
+    end[axis] += length
+    for _ in range(5):
         env.step(np.array([*start, 1.0]))
-    controls, _ = env.controls(np.array([*end, 1.0]))
+    controls, clipped = env.controls(np.array([*end, 1.0]))
+    assert not clipped
     for control in controls:
         env.data.ctrl[:] = control
         mujoco.mj_step(env.model, env.data)
-        across = np.delete(env.tool_position() - start, 1)
-        assert np.linalg.norm(across) < 0.003
+        across = np.delete(env.tool_position() - start, axis)
+        assert np.linalg.norm(across) < tolerance
+    assert np.linalg.norm(env.tool_position() - end) < 0.001
 
 
 def test_the_whole_workspace_is_reachable():
@@ -133,6 +149,34 @@ def test_a_waypoint_too_far_for_one_step_is_reported_and_reached_later():
     assert clipped[0]
     assert not clipped[-1]
     assert np.linalg.norm(env.tool_position() - across[:3]) < 0.002
+
+
+@pytest.mark.parametrize("gym_id", [*IDS, "hdp/BlockSorting2D-v0"])
+def test_an_unknown_option_of_a_reset_is_refused(gym_id):
+    with pytest.raises(ValueError, match="ordre"):
+        make(gym_id).reset(options={"ordre": [2, 0, 1]})
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"task": "XArmSorting-v0", "n_blocks": 7},
+        {"task": "XArmToolUse-v0", "waypoints_per_pose": 1},
+        {"task": "XArmSorting-v0", "fps": 99},
+        {"task": "BlockSorting2D-v0", "camera_width": 64},
+        {"task": "BlockSorting2D-v0", "robot": "menagerie"},
+    ],
+)
+def test_a_parameter_that_a_task_does_not_have_is_refused(parameters):
+    name = list(parameters)[-1]
+    with pytest.raises(ParsingError, match=f"--env.{name} must be left out"):
+        HDPEnv(**parameters)
+
+
+@pytest.mark.parametrize("task", ["XArmSorting-v0", "BlockSorting2D-v0"])
+def test_a_config_that_was_saved_loads_again(task):
+    saved = asdict(HDPEnv(task=task))
+    assert asdict(HDPEnv(**saved)) == saved
 
 
 @pytest.mark.parametrize("action", [np.zeros(3), np.full(4, np.nan), np.array([0.4, 0, 0.1, np.inf]), np.zeros((1, 4))])

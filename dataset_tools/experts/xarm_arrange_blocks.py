@@ -38,9 +38,9 @@ def arrange_blocks(env: gym.Env, rng: np.random.Generator) -> Demonstration:
 
 
 def possible_moves(positions: np.ndarray) -> list[Moves]:
-    """The orders and matchings, of all 36, that never put a block where another one is in the way.
+    """The orders and matchings, of all 36, that never put a block where another one leaves the open gripper no room.
 
-    Since no block is in the way of two slots, there is always one.
+    Since no block takes that room at two slots, there is always one.
 
     Args:
         positions: (3, 2) of the blocks, in metres.
