@@ -46,6 +46,12 @@ CHANGES: dict[str, dict[str, Any]] = {
         "optimizer_type": "muon",
         "optimizer_lr": 3e-3,
     },
+    "rotary=true, optimizer_type=muon, optimizer_lr=3e-3, start_share=0.3": {
+        "rotary": True,
+        "optimizer_type": "muon",
+        "optimizer_lr": 3e-3,
+        "start_share": 0.3,
+    },
     "ema_max_decay=0": {"ema_max_decay": 0.0},
     "dropout=0.1": {"dropout": 0.1},
     "dropout=0.3": {"dropout": 0.3},
@@ -75,8 +81,8 @@ is theirs. The curves on the X-Arm show it best. Tool use: 98 % of 100 starts af
 ([learned](../benchmarks/results/paper/mini/xarm_tool_use_hdp_seed0.json)). Arranging: 83 % after 800 steps
 ([rotary](../benchmarks/results/ablations/arrange_rotary=true_seed0.json)), where learned positions need 3,200 for as
 much ([learned](../benchmarks/results/paper/mini/xarm_arrange_blocks_hdp_seed0.json)). In sorting they do no harm. What
-is left of the failures in arranging is the plan itself, which puts a block where another one lies:
-[results](results.md) counts them.
+is left of the failures in arranging is the plan itself, which takes a slot where another block leaves no room for the
+open gripper: [results](results.md) counts them.
 
 For the rest, the preset predicts the clean motion, has a condition token for each object, made by large initial
 weights, masks by the linear schedule, has no dropout, trains on whole plans and does not give symbols more weight than

@@ -1,7 +1,7 @@
 """Film what is planned and executed, with the step of the plan that is being done.
 
-    MUJOCO_GL=egl python -m benchmarks.clips                       # docs/tasks/: the experts
-    MUJOCO_GL=egl python -m benchmarks.clips CHECKPOINT --prompt "... STACK red"   # docs/images/: a trained planner
+MUJOCO_GL=egl python -m benchmarks.clips                       # docs/tasks/: the experts
+MUJOCO_GL=egl python -m benchmarks.clips CHECKPOINT --prompt "... STACK red"   # docs/images/: a trained planner
 """
 
 import argparse

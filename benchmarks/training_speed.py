@@ -40,15 +40,15 @@ PAGE = DOCS / "training_speed.md"
 ON_A_GPU = """\
 ## On a GPU
 
-Nothing of this has been measured on a GPU yet, nor whether it reaches the goals on an H100: sorting's 15,600 steps in
-less than 3 minutes, and arranging's 312,000 in less than 20.
+Nothing of this has been measured on a GPU yet.
 
 What is there:
 
 - `--policy.dtype=bfloat16`: autocast in training and planning; weights, their average and the optimiser stay float32.
 - `--policy.compile_model=true`, with `--policy.compile_mode`: the denoiser through `torch.compile`.
 - Attention is PyTorch's `scaled_dot_product_attention`, with the kernel that PyTorch chooses.
-- AdamW is fused on CUDA; `--policy.optimizer_fused=false` switches that off.
+- AdamW is fused on CUDA; `--policy.optimizer_fused=false` switches that off. Muon (PyTorch's own) updates one matrix
+  after the other, some thousand small kernels a step; `--policy.optimizer_type=adamw` does without it.
 - The policy makes the host wait for the device once a step, for the losses in the log.
 
 What is not: the dataset stays in the host's memory, so each batch is copied, and the host waits for the copy. LeRobot's

@@ -1,6 +1,6 @@
 """What an expert hands to the recorder."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -35,6 +35,11 @@ class Demonstration:
     def remaining_symbols(self, frame: int) -> list[str]:
         """The symbols of the steps that are not yet done at a frame."""
         return [symbol for step in self.steps if step.stop > frame for symbol in step.symbols]
+
+    def remaining_token_ids(self, frame: int, vocabulary: Sequence[str], symbolic_horizon: int) -> np.ndarray:
+        """The same as token ids, positions in the vocabulary, filled with 0 (PAD): (symbolic_horizon,) int64."""
+        ids = [vocabulary.index(symbol) for symbol in self.remaining_symbols(frame)]
+        return np.array(ids + [0] * (symbolic_horizon - len(ids)), dtype=np.int64)
 
 
 Expert = Callable[[gym.Env, np.random.Generator], Demonstration]

@@ -173,7 +173,7 @@ def demonstrate(env: gym.Env, expert: Expert, seed: int, features_map: dict[str,
             {
                 **{column: _entry(observation, key) for key, column in features_map.items() if key != ACTION},
                 ACTION: action,
-                SYMBOLIC_PLAN: remaining_token_ids(demonstration, frame, task),
+                SYMBOLIC_PLAN: demonstration.remaining_token_ids(frame, task.vocabulary, task.symbolic_horizon),
                 REWARD: np.float32([score]),
                 SUCCESS: np.array([info["is_success"]]),
                 DONE: np.array([terminated or truncated]),
@@ -189,12 +189,6 @@ def _entry(observation: dict[str, Any], key: str) -> np.ndarray:
     for part in key.split("/"):
         observation = observation[part]
     return observation  # type: ignore[return-value]
-
-
-def remaining_token_ids(demonstration: Demonstration, frame: int, task: PlanningTask) -> np.ndarray:
-    """Token ids of what remains of the plan at a frame, filled with PAD: (symbolic_horizon,) int64."""
-    ids = [task.vocabulary.index(symbol) for symbol in demonstration.remaining_symbols(frame)]
-    return np.array(ids + [0] * (task.symbolic_horizon - len(ids)), dtype=np.int64)
 
 
 def dataset_features(config: RecordConfig) -> dict[str, dict[str, Any]]:

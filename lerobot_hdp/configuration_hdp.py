@@ -96,6 +96,10 @@ class HDPConfig(PreTrainedConfig):
             against the error of the noise; that of the clean motion is about ten times smaller.
         mask_schedule: how often training draws each level of masking: `linear`, all alike, or `cosine`, high ones more
             often and with less weight.
+        start_share: share of the training samples that are fully corrupted, motion and symbols, as a plan is where
+            sampling starts. There the planner decides which of several plans it makes, with nothing to go by but the
+            observation; independent levels show it next to no such samples. It needs thousands of demonstrations: of
+            a few hundred, the planner learns by heart which plan belongs to which start.
         ema_power, ema_max_decay: the weights that plan are an exponential moving average with the decay
             min(1 - (1 + update)^-ema_power, ema_max_decay), as in Diffusion Policy. `ema_max_decay` 0 switches it off.
 
@@ -150,6 +154,7 @@ class HDPConfig(PreTrainedConfig):
     prediction_type: str | None = None
     symbol_loss_weight: float | None = None
     mask_schedule: str = "linear"
+    start_share: float = 0.0
     ema_power: float = 0.75
     ema_max_decay: float = 0.9999
 
@@ -202,7 +207,7 @@ class HDPConfig(PreTrainedConfig):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ParsingError(f"{name} must be at least 1, got {value}")
-        for name in ("dropout", "confidence_threshold"):
+        for name in ("dropout", "confidence_threshold", "start_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ParsingError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if self.width % self.num_heads or self.width % 2:

@@ -1,13 +1,11 @@
 """D_theta: one transformer that denoises the motion and the symbols together (paper, Fig. "Architecture")."""
 
 import math
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
 
 class Prediction(NamedTuple):
@@ -38,38 +36,73 @@ class SinusoidalEmbedding(nn.Module):
         return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
-class RotaryDecoderLayer(nn.TransformerDecoderLayer):
-    """A transformer layer whose self-attention knows positions as rotations (RoFormer, Su et al. 2021).
+class DecoderLayer(nn.TransformerDecoderLayer):
+    """PyTorch's transformer layer, with rotary positions in self-attention (RoFormer, Su et al. 2021).
 
     Args:
-        positions: (L,) of the tokens; attention depends on their differences.
+        positions: (L,) of the tokens, whose attention then depends on their differences; None: no rotary positions.
         args, kwargs: of `nn.TransformerDecoderLayer`, with `batch_first=True`.
     """
 
-    def __init__(self, positions: Tensor, *args: Any, **kwargs: Any):
+    def __init__(self, positions: Tensor | None, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        half = self.self_attn.head_dim // 2
-        angles = positions[:, None] * 10_000 ** (-torch.arange(half) / half)
-        self.cosines: Tensor
-        self.sines: Tensor
-        self.register_buffer("cosines", angles.cos(), persistent=False)
-        self.register_buffer("sines", angles.sin(), persistent=False)
+        self.rotary = positions is not None
+        if positions is not None:
+            half = self.self_attn.head_dim // 2
+            angles = positions[:, None] * 10_000 ** (-torch.arange(half) / half)
+            self.cosines: Tensor
+            self.sines: Tensor
+            self.register_buffer("cosines", angles.cos(), persistent=False)
+            self.register_buffer("sines", angles.sin(), persistent=False)
 
     def _sa_block(
         self, x: Tensor, attn_mask: Tensor | None, key_padding_mask: Tensor | None, is_causal: bool = False
     ) -> Tensor:
         attention = self.self_attn
-        projected = F.linear(x, attention.in_proj_weight, attention.in_proj_bias)
-        query, key, value = projected.unflatten(-1, (3, attention.num_heads, attention.head_dim)).permute(2, 0, 3, 1, 4)
-        dropout = attention.dropout if self.training else 0.0
-        attended = F.scaled_dot_product_attention(self._rotate(query), self._rotate(key), value, dropout_p=dropout)
-        return self.dropout1(attention.out_proj(attended.transpose(1, 2).flatten(2)))
+        query, key, value = _heads(x, attention.in_proj_weight, attention.in_proj_bias, attention.head_dim)
+        if self.rotary:
+            query, key = self._rotate(query), self._rotate(key)
+        return self.dropout1(_attend(attention, query, key, value))
+
+    def _mha_block(
+        self,
+        x: Tensor,
+        mem: Tensor,
+        attn_mask: Tensor | None,
+        key_padding_mask: Tensor | None,
+        is_causal: bool = False,
+    ) -> Tensor:
+        attention, width = self.multihead_attn, x.shape[-1]
+        weights, biases = (
+            parameter.split([width, 2 * width]) for parameter in (attention.in_proj_weight, attention.in_proj_bias)
+        )
+        [query] = _heads(x, weights[0], biases[0], attention.head_dim)
+        key, value = _heads(mem, weights[1], biases[1], attention.head_dim)
+        return self.dropout2(_attend(attention, query, key, value))
 
     def _rotate(self, vectors: Tensor) -> Tensor:
         """Rotate each pair of components (i, i + half) by its token's angle: (B, heads, L, head_dim)."""
         first, second = vectors.chunk(2, dim=-1)
         cosines, sines = self.cosines.to(vectors.dtype), self.sines.to(vectors.dtype)
         return torch.cat([first * cosines - second * sines, first * sines + second * cosines], dim=-1)
+
+
+def _heads(x: Tensor, weight: Tensor, bias: Tensor, head_dim: int) -> Tensor:
+    """Project (B, L, width) tokens to n times their width, and split them: (n, B, heads, L, head_dim)."""
+    projected = F.linear(x, weight, bias).unflatten(-1, (-1, x.shape[-1] // head_dim, head_dim))
+    return projected.permute(2, 0, 3, 1, 4)
+
+
+def _attend(attention: nn.MultiheadAttention, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+    """What each query finds, (B, L, width), from (B, heads, L, head_dim) queries and (B, heads, L', head_dim) keys."""
+    dropout = attention.dropout if attention.training else 0.0
+    if query.device.type == "cpu" and query.dtype is torch.bfloat16 and torch.is_grad_enabled():
+        # PyTorch's kernels for this case take two to three times as long, most of it in the backward pass.
+        weights = F.softmax(query * query.shape[-1] ** -0.5 @ key.transpose(-1, -2), dim=-1)
+        attended = F.dropout(weights, dropout) @ value
+    else:
+        attended = F.scaled_dot_product_attention(query, key, value, dropout_p=dropout)
+    return attention.out_proj(attended.transpose(1, 2).flatten(2))
 
 
 class Denoiser(nn.Module):
@@ -130,11 +163,8 @@ class Denoiser(nn.Module):
         self.condition_encoder = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         sizes = (width, num_heads, 4 * width, dropout)
         kinds: dict[str, Any] = {"activation": "gelu", "batch_first": True, "norm_first": True}
-        if rotary:
-            places = torch.cat([torch.arange(horizon), torch.linspace(0, horizon - 1, symbolic_horizon)])
-            layer: nn.TransformerDecoderLayer = RotaryDecoderLayer(places, *sizes, **kinds)
-        else:
-            layer = nn.TransformerDecoderLayer(*sizes, **kinds)
+        places = torch.cat([torch.arange(horizon), torch.linspace(0, horizon - 1, symbolic_horizon)])
+        layer = DecoderLayer(places if rotary else None, *sizes, **kinds)
         self.decoder = nn.TransformerDecoder(layer, num_layers, norm=nn.LayerNorm(width))
         self.apply(_initialise)
         nn.init.normal_(self.positions, std=0.02)
@@ -170,19 +200,11 @@ class Denoiser(nn.Module):
 
         condition = torch.cat([torch.stack(levels, dim=1), observation], dim=1) + self.condition_positions
         memory = self.condition_encoder(condition)
-        with _attention_kernels(memory.device):
-            hidden = self.decoder(torch.cat(plan, dim=1) + self.positions, memory)
+        hidden = self.decoder(torch.cat(plan, dim=1) + self.positions, memory)
 
         motion_prediction = self.motion_head(hidden[:, : self.horizon])
         symbol_prediction = self.symbol_head(hidden[:, self.horizon :]) if self.models_symbols else None
         return Prediction(motion_prediction, symbol_prediction)
-
-
-def _attention_kernels(device: torch.device) -> AbstractContextManager:
-    """PyTorch's choice, but for bfloat16 training on a CPU, where its fused kernel has a slow backward pass."""
-    if device.type == "cpu" and torch.is_autocast_enabled("cpu") and torch.is_grad_enabled():
-        return sdpa_kernel(SDPBackend.MATH)
-    return nullcontext()
 
 
 def _initialise(module: nn.Module) -> None:

@@ -9,7 +9,7 @@ from torch.utils.data import default_collate
 
 from lerobot_hdp import FREE, HDPConfig, PlanPrompt
 from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
-from lerobot_hdp.denoiser import RotaryDecoderLayer
+from lerobot_hdp.denoiser import DecoderLayer
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.processor_hdp import SymbolicPlanProcessorStep
 from lerobot_hdp.prompt import encode_prompt
@@ -117,6 +117,20 @@ def test_both_losses_fall_in_training(make_planner, batch):
     for name in ("motion_loss", "symbol_loss"):
         first, last = (sum(parts[name] for parts in part) for part in (history[:10], history[-10:]))
         assert last < 0.7 * first
+
+
+@pytest.mark.parametrize("start_share", [0.0, 1.0])
+@pytest.mark.parametrize("policy_type", ["hdp", "separate_diffuser", "joint_diffuser"])
+def test_training_shows_the_start_of_sampling_as_often_as_it_is_told(make_planner, batch, policy_type, start_share):
+    policy, preprocessor, _ = make_planner(policy_type, start_share=start_share)
+    seen = []
+    policy.planner.denoiser.register_forward_pre_hook(lambda _, inputs: seen.append(inputs))
+    for _ in range(5):
+        policy.train().forward(preprocessor(batch))
+    starts = [bool((k_c == 1).all() and (k_d == 1).all()) for *_, k_c, k_d in seen]
+    assert all(starts) if start_share else not any(starts)
+    if policy_type == "hdp" and start_share:
+        assert all((symbols == policy.symbol_process.mask_id).all() for _, symbols, *_ in seen)
 
 
 def test_a_plan_is_whole_and_holds_no_mask(make_planner, batch):
@@ -304,12 +318,25 @@ def test_a_policy_goes_on_from_the_state_that_it_loads(make_planner, batch):
     assert all(torch.equal(value, ahead.state_dict()[name]) for name, value in behind.state_dict().items())
 
 
+@pytest.mark.parametrize("trains", [True, False])
+def test_attention_is_pytorchs_in_training_with_bfloat16_too(trains):
+    plain = torch.nn.TransformerDecoderLayer(32, 4, 64, 0.0, batch_first=True, norm_first=True)
+    layer = DecoderLayer(None, 32, 4, 64, 0.0, batch_first=True, norm_first=True)
+    layer.load_state_dict(plain.state_dict())
+    tokens, memory = torch.randn(2, 5, 32), torch.randn(2, 3, 32)
+    expected = plain(tokens, memory)
+    with torch.set_grad_enabled(trains):
+        torch.testing.assert_close(layer(tokens, memory), expected)
+        with torch.autocast("cpu", torch.bfloat16):
+            torch.testing.assert_close(layer(tokens, memory).float(), expected, atol=0.05, rtol=0.05)
+
+
 def test_rotary_attention_is_plain_attention_that_knows_distances():
     plain = torch.nn.TransformerDecoderLayer(32, 4, 64, 0.0, batch_first=True, norm_first=True)
     tokens, memory = torch.randn(2, 5, 32), torch.randn(2, 3, 32)
 
     def rotary(positions):
-        layer = RotaryDecoderLayer(torch.tensor(positions), 32, 4, 64, 0.0, batch_first=True, norm_first=True)
+        layer = DecoderLayer(torch.tensor(positions), 32, 4, 64, 0.0, batch_first=True, norm_first=True)
         layer.load_state_dict(plain.state_dict())
         return layer(tokens, memory)
 

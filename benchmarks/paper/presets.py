@@ -66,6 +66,8 @@ def _steps(epochs: int, demonstrations: int, batch_size: int) -> int:
 
 _MINI_2D = {"num_layers": 5, "width": 112, "num_inference_steps": 20}
 _MINI_XARM = {"num_layers": 4, "width": 128}
+_BEFORE_MUON = {"rotary": False, "optimizer_type": "adamw"}
+_MANY_DEMONSTRATIONS = {"start_share": 0.3}
 _TASKS_2D = {
     "block_sorting_2d_2_blocks": Training(200, steps=1000, batch_size=50, policy=_MINI_2D),
     "block_sorting_2d_3_blocks": Training(200, steps=1500, batch_size=50, policy=_MINI_2D),
@@ -85,9 +87,9 @@ PRESETS: dict[str, Preset] = {
     "default": Preset(
         policy={"preset": "default"},
         tasks={
-            "xarm_sorting": Training(200, 15_000, 50),
-            "xarm_arrange_blocks": Training(4_000, 60_000, 64),
-            "xarm_tool_use": Training(4_000, 60_000, 64),
+            "xarm_sorting": Training(200, 5_000, 50),
+            "xarm_arrange_blocks": Training(4_000, 10_000, 64, _MANY_DEMONSTRATIONS),
+            "xarm_tool_use": Training(4_000, 10_000, 64),
         },
     ),
     # `default` with a network of a tenth of the size, and as much training as a CPU core carries in half an hour.
@@ -95,8 +97,8 @@ PRESETS: dict[str, Preset] = {
         policy={"preset": "default", "dtype": "bfloat16", **_MINI_XARM},
         tasks={
             "xarm_sorting": Training(200, 2_400, 50),
-            "xarm_arrange_blocks": Training(4_000, 10_000, 50),
-            "xarm_tool_use": Training(1_000, 2_000, 50),
+            "xarm_arrange_blocks": Training(4_000, 5_000, 50, _MANY_DEMONSTRATIONS),
+            "xarm_tool_use": Training(400, 2_000, 50),
             "block_sorting_2d_2_blocks": Training(200, 1_000, 50),
             "block_sorting_2d_3_blocks": Training(200, 1_500, 50),
             "block_sorting_2d_4_blocks": Training(200, 2_500, 50),
@@ -105,14 +107,13 @@ PRESETS: dict[str, Preset] = {
         starts=100,
         average_last=3,
     ),
-    # The first version of `small`: without rotary positions and Muon, which became part of the preset `default` by what
+    # What `small` was before rotary positions and Muon, which became part of the preset `default` by what
     # docs/ablations.md says of them.
     "mini": Preset(
         policy={
             "preset": "default",
             "dtype": "bfloat16",
-            "rotary": False,
-            "optimizer_type": "adamw",
+            **_BEFORE_MUON,
             "optimizer_lr": 1e-3,
         },
         tasks={
@@ -132,8 +133,7 @@ PRESETS: dict[str, Preset] = {
         policy={
             "preset": "default",
             "dtype": "bfloat16",
-            "rotary": False,
-            "optimizer_type": "adamw",
+            **_BEFORE_MUON,
             "prediction_type": "epsilon",
             "optimizer_lr": 5e-4,
         },

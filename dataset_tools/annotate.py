@@ -1,0 +1,52 @@
+"""Give a LeRobotDataset without symbolic plans the column that a planner learns them from.
+
+Example:
+    from lerobot.datasets import LeRobotDataset
+    from dataset_tools.annotate import add_symbolic_plans
+    from dataset_tools.demonstration import PlanStep
+
+    # In episode 0 the cup is held from frame 40 on, and stands on the tray from frame 90 on; in episode 1 ...
+    plans = [[PlanStep(("PICK", "CUP"), 40), PlanStep(("PLACE", "TRAY"), 90)], ...]
+    add_symbolic_plans(LeRobotDataset("me/cups"), plans, "me/cups_with_plans", "outputs/cups_with_plans")
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.dataset_tools import add_features
+from lerobot.utils.constants import ACTION
+
+from gym_hdp_tasks import PAD
+
+from .demonstration import Demonstration, PlanStep
+from .language import SYMBOLIC_PLAN
+
+
+def add_symbolic_plans(
+    dataset: LeRobotDataset, plans: Sequence[Sequence[PlanStep]], repo_id: str, root: Path | str
+) -> LeRobotDataset:
+    """Copy a dataset, with what remains of the plan at each frame in the column `observation.symbolic_plan`.
+
+    The vocabulary is PAD and all symbols of the plans, in alphabetical order; a plan is as long as the longest.
+
+    Args:
+        dataset: to be copied, with all its episodes.
+        plans: of each episode, its steps in words, and the frame at which each is done.
+        repo_id: name of the new dataset.
+        root: its folder.
+
+    Raises:
+        ValueError: there is not one plan for each episode.
+    """
+    if len(plans) != dataset.meta.total_episodes:
+        raise ValueError(f"there are {len(plans)} plans for {dataset.meta.total_episodes} episodes")
+    vocabulary = [PAD, *sorted({symbol for plan in plans for step in plan for symbol in step.symbols})]
+    symbolic_horizon = max(sum(len(step.symbols) for step in plan) for plan in plans)
+    token_ids = []
+    for plan, length in zip(plans, dataset.meta.episodes["length"], strict=True):
+        demonstration = Demonstration(np.empty((length, *dataset.meta.shapes[ACTION])), tuple(plan))
+        token_ids += [demonstration.remaining_token_ids(frame, vocabulary, symbolic_horizon) for frame in range(length)]
+    column = {"dtype": "int64", "shape": (symbolic_horizon,), "names": None, "info": {"vocabulary": vocabulary}}
+    return add_features(dataset, {SYMBOLIC_PLAN: (np.stack(token_ids), column)}, output_dir=root, repo_id=repo_id)

@@ -1,0 +1,42 @@
+"""A dataset without symbolic plans gets some, and a planner trains on it."""
+
+import pytest
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.dataset_tools import remove_feature
+
+from dataset_tools.annotate import add_symbolic_plans
+from dataset_tools.demonstration import PlanStep
+from lerobot_hdp import HDPConfig
+
+from .conftest import HORIZON, run_command
+
+PICK, PLACE = PlanStep(("PICK", "CUP"), 8), PlanStep(("PLACE", "CUP", "TRAY"), 15)
+
+
+@pytest.fixture
+def without_plans(dataset_root, tmp_path) -> LeRobotDataset:
+    dataset = LeRobotDataset("test/sorting", root=dataset_root, video_backend="pyav")
+    return remove_feature(dataset, "observation.symbolic_plan", output_dir=tmp_path / "without", repo_id="test/without")
+
+
+def test_a_planner_trains_on_plans_that_were_written_afterwards(without_plans, tmp_path):
+    plans = [[PICK, PLACE], *[[PICK]] * (without_plans.meta.total_episodes - 1)]
+    with_plans = add_symbolic_plans(without_plans, plans, "test/with", tmp_path / "with")
+
+    first = [with_plans[frame]["observation.symbolic_plan"].tolist() for frame in (0, 7, 8, 15)]
+    vocabulary = with_plans.meta.features["observation.symbolic_plan"]["info"]["vocabulary"]
+    assert vocabulary == ["PAD", "CUP", "PICK", "PLACE", "TRAY"]
+    assert first == [[2, 1, 3, 1, 4], [2, 1, 3, 1, 4], [3, 1, 4, 0, 0], [0] * 5]
+    assert with_plans[HORIZON]["observation.symbolic_plan"].tolist() == [2, 1, 0, 0, 0]
+
+    flags = ["--dataset.repo_id=test/with", f"--dataset.root={tmp_path / 'with'}", "--dataset.video_backend=pyav"]
+    flags += ["--policy.type=hdp", f"--policy.horizon={HORIZON}", "--policy.num_layers=1", "--policy.width=32"]
+    flags += ["--policy.push_to_hub=false", "--batch_size=2", "--steps=1", "--env_eval_freq=0"]
+    run_command("hdp-train", *flags, f"--output_dir={tmp_path / 'run'}")
+    trained = HDPConfig.from_pretrained(tmp_path / "run/checkpoints/last/pretrained_model")
+    assert (trained.vocabulary, trained.symbolic_horizon) == (vocabulary, 5)
+
+
+def test_every_episode_needs_a_plan(without_plans, tmp_path):
+    with pytest.raises(ValueError, match=r"there are 1 plans for \d+ episodes"):
+        add_symbolic_plans(without_plans, [[PICK]], "test/with", tmp_path / "with")
