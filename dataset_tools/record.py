@@ -48,7 +48,7 @@ import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from gym_hdp_tasks import PlanningTask
 from gym_hdp_tasks.env_config import HDPEnv
 
-from .demonstration import Demonstration, Expert, expert_generator
+from .demonstration import Expert, expert_generator
 from .experts import EXPERTS
 from .interruption import deferred_signals, end_with_parent, exit_when_terminated
 from .language import SYMBOLIC_PLAN, write_language_columns
