@@ -5,7 +5,6 @@ OUT := outputs/quickstart
 CONFIG := configs/block_sorting_2d_2_blocks.json
 TASK := --env.task=BlockSorting2D-v0 --env.n_blocks=2 --env.waypoints_per_pose=1
 
-export MUJOCO_GL ?= egl
 export TOKENIZERS_PARALLELISM = false
 
 .PHONY: help setup quickstart test lint format clean
@@ -52,4 +51,4 @@ format: setup
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf .venv outputs build dist
+	rm -rf .venv $(OUT) build dist

@@ -29,14 +29,13 @@ QUALITY = 60
 SEED = 3
 
 
-def film(env: gym.Env, waypoints: np.ndarray, steps: tuple[PlanStep, ...], title: str = "") -> list[np.ndarray]:
+def film(env: gym.Env, waypoints: np.ndarray, steps: tuple[PlanStep, ...]) -> list[np.ndarray]:
     """Frames (HEIGHT + CAPTION_HEIGHT, WIDTH, 3) of a plan's execution, up to the end of its last step.
 
     Args:
         env: an X-Arm task that was just reset and renders.
         waypoints: (horizon, 4) actions.
         steps: of the symbolic plan.
-        title: written before each step.
     """
     env = env.unwrapped
     physics_steps_per_capture = round(1 / CAPTURES_PER_SECOND / env.model.opt.timestep)
@@ -48,7 +47,7 @@ def film(env: gym.Env, waypoints: np.ndarray, steps: tuple[PlanStep, ...], title
             env.data.ctrl[:] = control
             mujoco.mj_step(env.model, env.data)
             if count % physics_steps_per_capture == 0:
-                frames.append(captioned(env.render(), title + " ".join(current.symbols)))
+                frames.append(captioned(env.render(), " ".join(current.symbols)))
     return frames
 
 

@@ -459,11 +459,13 @@ def try_environment(config: RecordConfig) -> None:
 
 def plan_shards(config: RecordConfig) -> list[Shard]:
     """The shards of a recording, in a folder beside the dataset's that remembers the settings."""
-    partial = config.partial_root
+    partial, total = config.partial_root, config.dataset.num_episodes
+    starts = shard_starts(total)
     settings = {
         "env": asdict(config.env),
         "seed": config.seed,
-        "num_episodes": config.dataset.num_episodes,
+        "num_episodes": total,
+        "episodes_per_shard": starts.step,
         "video": config.dataset.video,
     }
     settings = json.loads(json.dumps(settings, default=str))
@@ -474,8 +476,6 @@ def plan_shards(config: RecordConfig) -> list[Shard]:
         raise ValueError(f"{settings_file} has other settings than this command: use the same ones to resume")
     partial.mkdir(parents=True, exist_ok=True)
     settings_file.write_text(json.dumps(settings, indent=2))
-    total = config.dataset.num_episodes
-    starts = shard_starts(total)
     if len(starts) < config.num_workers:
         logging.warning(f"only {len(starts)} of {config.num_workers} workers have work: {total} episodes are few")
     return [Shard(partial / f"episodes_{start:06d}", start, min(start + starts.step, total)) for start in starts]

@@ -210,6 +210,8 @@ class HDPConfig(PreTrainedConfig):
         for name in ("dropout", "confidence_threshold", "start_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ParsingError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+        if self.start_share and self.symbol_process is None:
+            raise ParsingError("start_share is about symbols, which this planner does not model: leave it at 0")
         if self.width % self.num_heads or self.width % 2:
             raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
         if self.rotary and self.width // self.num_heads % 2:

@@ -39,6 +39,8 @@ class SinusoidalEmbedding(nn.Module):
 class DecoderLayer(nn.TransformerDecoderLayer):
     """PyTorch's transformer layer, with rotary positions in self-attention (RoFormer, Su et al. 2021).
 
+    Every token attends to every other and to all of the memory: it takes no masks.
+
     Args:
         positions: (L,) of the tokens, whose attention then depends on their differences; None: no rotary positions.
         args, kwargs: of `nn.TransformerDecoderLayer`, with `batch_first=True`.
@@ -58,6 +60,8 @@ class DecoderLayer(nn.TransformerDecoderLayer):
     def _sa_block(
         self, x: Tensor, attn_mask: Tensor | None, key_padding_mask: Tensor | None, is_causal: bool = False
     ) -> Tensor:
+        assert attn_mask is None
+        assert key_padding_mask is None
         attention = self.self_attn
         query, key, value = _heads(x, attention.in_proj_weight, attention.in_proj_bias, attention.head_dim)
         if self.rotary:
@@ -72,6 +76,8 @@ class DecoderLayer(nn.TransformerDecoderLayer):
         key_padding_mask: Tensor | None,
         is_causal: bool = False,
     ) -> Tensor:
+        assert attn_mask is None
+        assert key_padding_mask is None
         attention, width = self.multihead_attn, x.shape[-1]
         weights, biases = (
             parameter.split([width, 2 * width]) for parameter in (attention.in_proj_weight, attention.in_proj_bias)

@@ -2,7 +2,8 @@
 
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -204,10 +205,9 @@ class HDPPolicy(PreTrainedPolicy):
 
     def _samples_at_start(self, levels: Tensor, generator: Generator | None) -> Tensor:
         """Which samples are fully corrupted, as a plan is where sampling starts: like levels, bool."""
-        share = self.config.start_share if self.symbol_process else 0.0
-        if share == 0:
+        if self.config.start_share == 0:
             return torch.zeros_like(levels, dtype=torch.bool)
-        return torch.rand(len(levels), device=levels.device, generator=generator) < share
+        return torch.rand(len(levels), device=levels.device, generator=generator) < self.config.start_share
 
     def _sample_levels(self, process: Process, batch_size: int, generator: Generator | None) -> Tensor:
         """Levels for the batches of all processes of a distributed run, (processes x B,); see `_corrupt`."""
@@ -253,7 +253,6 @@ class HDPPolicy(PreTrainedPolicy):
             ValueError: an observation with NaN or infinity, a prompt that does not fit, or a checker with nothing to
                 choose from.
         """
-        self.eval()
         k = num_candidates
         if k is None:
             partial = isinstance(prompt, PlanPrompt) and prompt.gives_part_of_motion and self.can_score
@@ -290,7 +289,6 @@ class HDPPolicy(PreTrainedPolicy):
         Raises:
             ValueError: this planner cannot say.
         """
-        self.eval()
         if not self.can_score:
             raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
         processes = self.motion_process, self.symbol_process
@@ -385,7 +383,7 @@ class HDPPolicy(PreTrainedPolicy):
         observation = network.encoder(batch)
 
         def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
-            with self._autocast():
+            with self._autocast(), _without_dropout(network):
                 prediction = network.denoiser(motion, symbols, observation, k_c, k_d)
             return Prediction(*(None if part is None else part.float() for part in prediction))
 
@@ -399,6 +397,7 @@ class HDPPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
         """The next action of the plan, after making one if there is none: (B, D)."""
+        self.eval()
         if not self._queue:
             self._queue.extend(self.predict_action_chunk(batch).unbind(dim=1))
         return self._queue.popleft()
@@ -464,6 +463,8 @@ class HDPPolicy(PreTrainedPolicy):
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{model_file} is missing from the checkpoint") from error
         except RuntimeError as error:
+            if "Error(s) in loading state_dict" not in str(error):
+                raise
             first = next((line.strip() for line in str(error).splitlines()[1:] if line.strip()), str(error))
             raise ValueError(f"the settings do not fit the weights in {model_file}: {first}") from error
         except SafetensorError as error:
@@ -482,6 +483,17 @@ def make_processes(config: HDPConfig) -> tuple[GaussianProcess, SymbolProcess | 
             return motion, GaussianSymbolProcess(len(config.vocabulary), *gaussian)
         case _:
             return motion, None
+
+
+@contextmanager
+def _without_dropout(network: nn.Module) -> Iterator[None]:
+    """A policy may plan in the middle of its training."""
+    was_training = network.training
+    network.eval()
+    try:
+        yield
+    finally:
+        network.train(was_training)
 
 
 @torch.no_grad()

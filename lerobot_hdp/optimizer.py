@@ -90,9 +90,9 @@ class MuonAdamW(Optimizer):
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:
         """Update all parameters. No closure is taken."""
-        own = len(self._muon.param_groups)
-        for part, groups in ((self._muon, self.param_groups[:own]), (self._adamw, self.param_groups[own:])):
-            part.param_groups, part.state = groups, self.state  # a resumed run has replaced both
+        of_muon = len(self._muon.param_groups)
+        for part, groups in ((self._muon, self.param_groups[:of_muon]), (self._adamw, self.param_groups[of_muon:])):
+            part.param_groups, part.state = groups, self.state  # loading a state replaces both
             part.step()
 
 

@@ -68,17 +68,21 @@ def test_a_state_encoder_with_hidden_units_is_not_linear(make_planner, batch, hi
     assert torch.allclose(encode(between), (encode(near) + encode(far)) / 2, atol=1e-5) == is_linear
 
 
-def test_what_hardly_varies_in_the_dataset_is_not_blown_up(dataset, make_planner, batch, tmp_path):
+def test_what_hardly_varies_in_the_dataset_is_not_blown_up(dataset, make_planner, batch, tmp_path, monkeypatch):
     """Neither in a new training, nor in one that goes on from a checkpoint, as `lerobot-train` makes its normaliser."""
     key = "observation.environment_state"
-    stats = dataset.meta.stats[key]
-    raw = {bound: stats[bound].copy() for bound in ("min", "max")}
-    stats["max"][0] = stats["min"][0] + 1e-6
+    raw = dataset.meta.stats[key]
+
+    def with_a_narrow_component() -> None:
+        narrow = raw["max"].copy()
+        narrow[0] = raw["min"][0] + 1e-6
+        monkeypatch.setitem(dataset.meta.stats, key, {**raw, "max": narrow})
+
+    with_a_narrow_component()
     _, new, postprocessor = make_planner()
     for processor in (new, postprocessor):
         processor.save_pretrained(tmp_path)
-    stats |= {bound: raw[bound].copy() for bound in raw}
-    stats["max"][0] = stats["min"][0] + 1e-6
+    with_a_narrow_component()
     policy, *_ = make_planner()
     resumed, _ = make_pre_post_processors(
         policy.config, str(tmp_path), preprocessor_overrides={"normalizer_processor": {"stats": dataset.meta.stats}}
@@ -254,6 +258,8 @@ def test_planning_has_no_dropout_even_while_the_policy_trains(make_planner, inpu
     policy, *_ = make_planner(dropout=0.5, ema_max_decay=ema_max_decay)
     plans = [policy.train().plan(observation(inputs), generator=torch.Generator().manual_seed(0)) for _ in range(2)]
     assert torch.equal(plans[0].actions, plans[1].actions)
+    assert policy.training
+    assert policy.planner.training
 
 
 def test_planning_uses_the_moving_average_of_the_weights(make_planner, batch):
@@ -323,12 +329,17 @@ def test_attention_is_pytorchs_in_training_with_bfloat16_too(trains):
     plain = torch.nn.TransformerDecoderLayer(32, 4, 64, 0.0, batch_first=True, norm_first=True)
     layer = DecoderLayer(None, 32, 4, 64, 0.0, batch_first=True, norm_first=True)
     layer.load_state_dict(plain.state_dict())
-    tokens, memory = torch.randn(2, 5, 32), torch.randn(2, 3, 32)
+    tokens, memory = torch.randn(2, 5, 32, requires_grad=True), torch.randn(2, 3, 32)
     expected = plain(tokens, memory)
+    [gradient] = torch.autograd.grad(expected.square().sum(), tokens)
     with torch.set_grad_enabled(trains):
         torch.testing.assert_close(layer(tokens, memory), expected)
         with torch.autocast("cpu", torch.bfloat16):
-            torch.testing.assert_close(layer(tokens, memory).float(), expected, atol=0.05, rtol=0.05)
+            found = layer(tokens, memory).float()
+        torch.testing.assert_close(found, expected, atol=0.05, rtol=0.05)
+    if trains:
+        [found_gradient] = torch.autograd.grad(found.square().sum(), tokens)
+        assert (found_gradient - gradient).norm() < 0.05 * gradient.norm()
 
 
 def test_rotary_attention_is_plain_attention_that_knows_distances():

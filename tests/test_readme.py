@@ -14,3 +14,4 @@ def test_the_examples_in_python_run():
     assert result.returncode == 0, result.stderr
     assert "PICK 1.00  B 1.00" in result.stdout
     assert "(145, 4)" in result.stdout
+    assert "True" in result.stdout.splitlines()

@@ -122,7 +122,7 @@ def unpack(folder: Path) -> None:
 
 
 def export(checkpoint: Path, target: Path, max_file_size: str = "5GB") -> None:
-    """Write a checkpoint that only plans: the averaged weights, as bfloat16.
+    """Write a checkpoint to plan with: the averaged weights, as bfloat16. What trains it on begins a new average.
 
     Args:
         checkpoint: a `pretrained_model` folder.
@@ -137,7 +137,8 @@ def export(checkpoint: Path, target: Path, max_file_size: str = "5GB") -> None:
     policy, *_ = load_policy(checkpoint)
     if policy.ema is not None:
         policy.planner.load_state_dict(policy.ema.module.state_dict())
-        policy.ema, policy.config.ema_max_decay = None, 0.0
+        policy.ema = None
+    policy.config.pretrained_path = None
     unfinished = target.with_name(f"{target.name}.new")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)

@@ -107,8 +107,7 @@ PRESETS: dict[str, Preset] = {
         starts=100,
         average_last=3,
     ),
-    # What `small` was before rotary positions and Muon, which became part of the preset `default` by what
-    # docs/ablations.md says of them.
+    # Before rotary positions and Muon became part of the preset `default`: the base of docs/ablations.md.
     "mini": Preset(
         policy={
             "preset": "default",
@@ -159,7 +158,8 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
     if method == "hdp":
         policy |= preset.hdp_policy
     if PreTrainedConfig.get_choice_class(method).symbol_process is None:
-        policy.pop("symbolic_horizon", None)
+        for about_symbols in ("symbolic_horizon", "start_share"):
+            policy.pop(about_symbols, None)
     return Cell(
         group=f"paper/{preset_name}",
         name=f"{task}_{method}_seed{seed}",

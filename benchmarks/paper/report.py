@@ -26,8 +26,8 @@ TASKS_2D = {f"block_sorting_2d_{n}_blocks": f"{n} blocks" for n in (2, 3, 4)}
 TITLES = {
     "paper": "The paper's hyperparameters",
     "default": "Our settings at the paper's network size",
-    "small": "On two CPU cores: a network of a tenth of the size, condition tokens by an MLP, an hour of training",
-    "mini": "On two CPU cores: a network of a tenth of the size, learned positions alone, minutes of training",
+    "small": "Our settings with a network of a tenth of the size, on a CPU core",
+    "mini": "Earlier settings, without rotary positions and Muon, on a CPU core",
     "mini_epsilon": "The same, predicting the noise, as the paper does",
 }
 MISSING = "missing"
@@ -60,12 +60,12 @@ def write_report(page: Path = DOCS / "results.md") -> list[Path]:
         "The mean score and, in parentheses, its standard deviation over seeds and over the checkpoints at the end of "
         "training, as the paper gives them; then the 95 % interval of the mean over trainings (Student's t over "
         "seeds), if there is more than one.\n",
-        *(simulation(preset, XARM_TASKS, results) for preset in ("paper", "default", "small", "mini")),
+        *(simulation(preset, XARM_TASKS, results) for preset in ("small", "mini", "default", "paper")),
         "## The number of blocks\n",
         "2D sorting, with one waypoint a pose (19, 37 and 55 actions; the paper has longer ones). The paper shows this "
         "as a bar plot without figures: Diffuser and its variants fall with the number of blocks, HDP hardly does.\n",
         f"![Mean score over the number of blocks]({blocks.relative_to(page.parent)})\n",
-        *(simulation(preset, TASKS_2D, results) for preset in ("mini", "mini_epsilon")),
+        *(simulation(preset, TASKS_2D, results) for preset in ("small", "mini", "mini_epsilon")),
         "### With a valid plan given\n",
         valid_plan(),
         "## HDP and Diffuser over training\n",
@@ -128,7 +128,7 @@ def score(contents: Sequence[dict[str, Any]] | None) -> str:
     of_seeds = [mean(100 * point["mean_score"] for point in last_points([content])) for content in contents]
     half = T_95[len(of_seeds) - 2] * stdev(of_seeds) / math.sqrt(len(of_seeds))
     low, high = max(0, mean(of_seeds) - half), min(100, mean(of_seeds) + half)
-    return f"{text}, {low:.0f} to {high:.0f}"
+    return f"{text}, {len(of_seeds)} seeds: {low:.0f} to {high:.0f}"
 
 
 def plot_training(results: Results, path: Path) -> None:
@@ -147,17 +147,21 @@ def plot_training(results: Results, path: Path) -> None:
 def plot_blocks(results: Results, path: Path) -> None:
     """The paper's bar plot over the number of blocks: the mean of all seeds and checkpoints that count."""
     plt = use_svg()
-    figure, axis = plt.subplots(figsize=(6, 3), layout="constrained")
-    for number, method in enumerate(METHODS):
-        for position, task in enumerate(TASKS_2D):
-            if contents := results.get(("mini", task, method)):
-                height = mean(point["mean_score"] for point in last_points(contents))
-                label = LABELS[method] if task == next(iter(TASKS_2D)) else None
-                axis.bar(position + 0.13 * (number - 2.5), height, 0.12, color=COLOURS[method], label=label)
-    axis.set_xticks(range(len(TASKS_2D)), TASKS_2D.values())
-    axis.set(ylabel="mean score", ylim=(0, 1.02), title="2D sorting (preset mini)")
-    if axis.patches:
-        axis.legend(fontsize=8, loc="lower left")
+    presets = ("small", "mini")
+    figure, axes = plt.subplots(1, len(presets), figsize=(9, 3), sharey=True, layout="constrained")
+    for preset, axis in zip(presets, axes, strict=True):
+        methods = [method for method in METHODS if any((preset, task, method) in results for task in TASKS_2D)]
+        for number, method in enumerate(methods):
+            for position, task in enumerate(TASKS_2D):
+                if contents := results.get((preset, task, method)):
+                    height = mean(point["mean_score"] for point in last_points(contents))
+                    label = LABELS[method] if task == next(iter(TASKS_2D)) else None
+                    place = position + 0.13 * (number - (len(methods) - 1) / 2)
+                    axis.bar(place, height, 0.12, color=COLOURS[method], label=label)
+        axis.set_xticks(range(len(TASKS_2D)), TASKS_2D.values())
+        axis.set(ylabel="mean score", ylim=(0, 1.02), title=f"2D sorting, preset {preset}")
+        if axis.patches:
+            axis.legend(fontsize=7, loc="lower left")
     save_figure(figure, path)
 
 
