@@ -1,0 +1,41 @@
+"""Evaluate the planners of `checkpoints/` as they are shipped: bfloat16 weights, their own settings.
+
+python -m benchmarks.checkpoints
+"""
+
+import argparse
+import json
+import time
+
+from .evaluation import evaluate, wilson_interval
+from .machine import REPOSITORY, RESULTS, describe_run
+
+FIRST_SEED = 3_000_000
+"""Of the starts; no evaluation during training has these."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--starts", type=int, default=200)
+    options = parser.parse_args()
+    results = []
+    for config in sorted((REPOSITORY / "checkpoints").glob("*/config.json")):
+        begin = time.monotonic()
+        result = evaluate(config.parent, options.starts, FIRST_SEED)
+        successes = round(result["success_rate"] * options.starts)
+        results.append(
+            {
+                "checkpoint": config.parent.name,
+                "starts": options.starts,
+                "interval_95": wilson_interval(successes, options.starts),
+                **result,
+                "seconds": round(time.monotonic() - begin, 1),
+            }
+        )
+        print(json.dumps(results[-1]))
+    content = {"run": describe_run(), "results": results}
+    (RESULTS / "checkpoints.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
