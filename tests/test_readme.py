@@ -1,10 +1,15 @@
-"""What the README shows of Python does what it says."""
+"""What the README shows of Python does what it says, and the pages' links lead somewhere."""
 
 import re
 import subprocess
 import sys
+from pathlib import Path
+
+import pytest
 
 from .conftest import REPOSITORY
+
+PAGES = [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("checkpoints/*.md"), *REPOSITORY.glob("docs/**/*.md")]
 
 
 def test_the_examples_in_python_run():
@@ -15,3 +20,12 @@ def test_the_examples_in_python_run():
     assert "PICK 1.00  B 1.00" in result.stdout
     assert "(145, 4)" in result.stdout
     assert "True" in result.stdout.splitlines()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_links_lead_somewhere(page: Path):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    targets = re.findall(r"\]\(([^)#\s]+)[^)]*\)|src=\"([^\"]+)\"", text)
+    links = [link or source for link, source in targets]
+    missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
+    assert not missing

@@ -107,6 +107,26 @@ PRESETS: dict[str, Preset] = {
         starts=100,
         average_last=3,
     ),
+    # The same network before Muon, with condition tokens by an MLP, and trained for longer.
+    "small_adamw": Preset(
+        policy={
+            "preset": "default",
+            "dtype": "bfloat16",
+            "optimizer_type": "adamw",
+            "optimizer_lr": 1e-3,
+            "state_encoder_hidden_dim": 256,
+            "observation_weight_std": 2.0,
+            **_MINI_XARM,
+        },
+        tasks={
+            "xarm_sorting": Training(200, 6_000, 50),
+            "xarm_arrange_blocks": Training(4_000, 40_000, 50),
+            "xarm_tool_use": Training(1_000, 6_000, 50),
+        },
+        evaluations=10,
+        starts=100,
+        average_last=3,
+    ),
     # Before rotary positions and Muon became part of the preset `default`: the base of docs/ablations.md.
     "mini": Preset(
         policy={
