@@ -1,6 +1,6 @@
 """What every task states about itself: its words, its sizes and its units."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,16 +50,6 @@ class PlanningTask:
             raise ValueError(f"the first symbol of a vocabulary is {PAD}, got {self.vocabulary[0]!r}")
         if len(set(self.vocabulary)) != len(self.vocabulary):
             raise ValueError(f"a vocabulary names each symbol once, got {self.vocabulary}")
-
-
-def refuse_unknown_options(options: Mapping[str, Any] | None, known: Sequence[str]) -> None:
-    """Check the options of a `reset`.
-
-    Raises:
-        ValueError: there is one that the task does not know.
-    """
-    if unknown := [name for name in options or {} if name not in known]:
-        raise ValueError(f"reset takes {' and '.join(known) or 'none'} as options, got {unknown}")
 
 
 def equal_steps(steps: int, tokens: int, waypoints: int) -> tuple[tuple[int, int], ...]:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from .scene import BLOCK_HALF_SIZE, FRONT_CAMERA, FRONT_CAMERA_FOVY, furnish
-from .task import PlanningTask, refuse_unknown_options
+from .task import PlanningTask
 from .waypoint_motion import WaypointMotion
 from .xarm7 import ARM_JOINTS, GRIPPERS, ROBOT_CONTYPE, TCP_SITE, WRIST_CAMERA, robot_spec
 
@@ -67,8 +67,6 @@ class XArmEnv(gym.Env):
     action_space: gym.spaces.Box
     object_names: tuple[str, ...]
     """The task's free bodies, in the order of `environment_state`."""
-    reset_options: tuple[str, ...] = ()
-    """What `place_objects` lets one fix."""
     camera_position = np.array([0.98, 0.0, 0.52])
     """Where the camera `front` is."""
     camera_target = np.array([0.37, 0.0, 0.05])
@@ -153,9 +151,8 @@ class XArmEnv(gym.Env):
             options: what a task lets one fix; see its `place_objects`.
 
         Raises:
-            ValueError: the task does not know an option, or not with this value.
+            ValueError: an option that the task knows has a value that it cannot have.
         """
-        refuse_unknown_options(options, self.reset_options)
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
         self.place_objects(options or {})

@@ -66,7 +66,6 @@ class XArmSortingEnv(XArmEnv):
     """
 
     object_names = BLOCKS
-    reset_options = ("order",)
 
     def __init__(self, robot: str = "primitive", **kwargs: Any):
         super().__init__(xarm_sorting_task(robot), robot=robot, **kwargs)

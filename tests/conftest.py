@@ -173,7 +173,7 @@ def trained(dataset) -> Trained:
     data = preprocessor({**seen.batch, "observation.symbolic_plan": tokens})
     keys, steps, peak_lr = [*seen.batch, "observation.symbolic_plan"], 400, 3e-3
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, peak_lr, steps, pct_start=0.1)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, peak_lr, steps, pct_start=0.1, cycle_momentum=False)
     policy.train()
     for _ in range(steps):
         chosen = torch.randint(len(tokens), (64,))

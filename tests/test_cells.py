@@ -197,7 +197,7 @@ def test_the_report_has_what_was_run_and_says_what_is_missing(tmp_path, monkeypa
     assert all(path.exists() for path in plots)
     text = page.read_text()
     # Means of the seeds 0.9 and 0.9, standard deviation of 0.8, 0.9, 1.0, 0.9, 0.9, 0.9: 6.3 %.
-    assert "| HDP | 86 % (5 %) | 90 % (6 %), 90 to 90 | 74 % (10 %) | missing | 78 % (4 %) | missing |" in text
+    assert "| HDP | 86 % (5 %) | 90 % (6 %), 2 seeds: 90 to 90 | 74 % (10 %) | missing | 78 % (4 %) | missing |" in text
     assert "| Diffuser | 46 % (6 %) | 20 % (35 %), one seed |" in text
     assert "| xarm_sorting, mini | 600 | 9 | 3 | 6 |" in text
     assert "| xarm_sorting, mini | 1.5 min, 7/s | 1.5 min, 7/s | missing |" in text

@@ -296,7 +296,8 @@ def test_two_processes_do_what_one_does_with_twice_the_batch(dataset_root, lerob
     assert losses(result) == losses(expected)
     one, two = weights(expected_dir), weights(tmp_path / "run")
     for name, value in one.items():
-        torch.testing.assert_close(two[name], value, rtol=1e-4, atol=1e-6)
+        # Muon computes in bfloat16, which makes small differences larger.
+        torch.testing.assert_close(two[name], value, rtol=1e-2, atol=1e-5)
 
 
 def test_two_processes_that_are_out_of_time_leave_a_checkpoint(dataset_root, tmp_path):

@@ -151,12 +151,6 @@ def test_a_waypoint_too_far_for_one_step_is_reported_and_reached_later():
     assert np.linalg.norm(env.tool_position() - across[:3]) < 0.002
 
 
-@pytest.mark.parametrize("gym_id", [*IDS, "hdp/BlockSorting2D-v0"])
-def test_an_unknown_option_of_a_reset_is_refused(gym_id):
-    with pytest.raises(ValueError, match="ordre"):
-        make(gym_id).reset(options={"ordre": [2, 0, 1]})
-
-
 @pytest.mark.parametrize(
     "parameters",
     [
