@@ -5,6 +5,7 @@ MUJOCO_GL=egl python -m benchmarks.clips CHECKPOINT --prompt "... STACK red"   #
 """
 
 import argparse
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -90,11 +91,8 @@ def film_planner(checkpoint: Path, prompt: str | None, seed: int) -> None:
 
 def plan_steps(symbols: list[str], task: PlanningTask) -> tuple[PlanStep, ...]:
     """The steps of a symbolic plan, at the time that all demonstrations of the task keep."""
-    firsts = [0, *(tokens for tokens, _ in task.step_ends)]
-    steps = zip(firsts, task.step_ends, strict=False)
-    return tuple(
-        PlanStep(tuple(symbols[first:tokens]), stop) for first, (tokens, stop) in steps if symbols[first:tokens]
-    )
+    ends = pairwise([(0, 0), *task.step_ends])
+    return tuple(PlanStep(tuple(symbols[first:end]), stop) for (first, _), (end, stop) in ends if symbols[first:end])
 
 
 def main() -> None:

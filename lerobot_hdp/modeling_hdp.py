@@ -2,9 +2,9 @@
 
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,22 @@ from .processor_hdp import widen_narrow_ranges
 from .prompt import choose_placement, encode_prompt, shared_tokens
 from .sampling import Denoise, DenoisingState, sample_plan
 from .vocabulary import FREE, FREE_SYMBOL, PAD_ID, Vocabulary
+
+
+def _without_dropout[**P, R](method: Callable[P, R]) -> Callable[P, R]:
+    """Let a method of a policy plan without dropout, also in the middle of the policy's training."""
+
+    @wraps(method)
+    def in_eval_mode(*args: P.args, **kwargs: P.kwargs) -> R:
+        network: nn.Module = args[0]._planning_network  # type: ignore[attr-defined]
+        was_training = network.training
+        network.eval()
+        try:
+            return method(*args, **kwargs)
+        finally:
+            network.train(was_training)
+
+    return in_eval_mode
 
 
 class Planner(nn.Module):
@@ -226,6 +242,7 @@ class HDPPolicy(PreTrainedPolicy):
         return Corrupted(corrupted.value[own], corrupted.target[own], corrupted.level[own])
 
     @torch.no_grad()
+    @_without_dropout
     def plan(
         self,
         batch: dict[str, Tensor],
@@ -283,6 +300,7 @@ class HDPPolicy(PreTrainedPolicy):
         return replace(kept, scores=scores[samples, best], candidate=best)
 
     @torch.no_grad()
+    @_without_dropout
     def score(self, batch: dict[str, Tensor], plan: Plan) -> Tensor:
         """How likely a plan for each observation is under the model, up to scale: (B,), see `score_plans`.
 
@@ -295,6 +313,7 @@ class HDPPolicy(PreTrainedPolicy):
         return score_plans(self._denoiser(batch), *processes, plan.actions, plan.token_ids)
 
     @torch.no_grad()
+    @_without_dropout
     def read_prompt(
         self,
         batch: dict[str, Tensor],
@@ -383,7 +402,7 @@ class HDPPolicy(PreTrainedPolicy):
         observation = network.encoder(batch)
 
         def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
-            with self._autocast(), _without_dropout(network):
+            with self._autocast():
                 prediction = network.denoiser(motion, symbols, observation, k_c, k_d)
             return Prediction(*(None if part is None else part.float() for part in prediction))
 
@@ -483,17 +502,6 @@ def make_processes(config: HDPConfig) -> tuple[GaussianProcess, SymbolProcess | 
             return motion, GaussianSymbolProcess(len(config.vocabulary), *gaussian)
         case _:
             return motion, None
-
-
-@contextmanager
-def _without_dropout(network: nn.Module) -> Iterator[None]:
-    """A policy may plan in the middle of its training."""
-    was_training = network.training
-    network.eval()
-    try:
-        yield
-    finally:
-        network.train(was_training)
 
 
 @torch.no_grad()

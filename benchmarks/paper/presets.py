@@ -65,6 +65,7 @@ def _steps(epochs: int, demonstrations: int, batch_size: int) -> int:
 
 
 _MINI_2D = {"num_layers": 5, "width": 112, "num_inference_steps": 20}
+_ON_A_CPU: dict[str, Any] = {"evaluations": 10, "starts": 100, "average_last": 3}
 _MINI_XARM = {"num_layers": 4, "width": 128}
 _BEFORE_MUON = {"rotary": False, "optimizer_type": "adamw"}
 _MANY_DEMONSTRATIONS = {"start_share": 0.3}
@@ -103,9 +104,7 @@ PRESETS: dict[str, Preset] = {
             "block_sorting_2d_3_blocks": Training(200, 1_500, 50),
             "block_sorting_2d_4_blocks": Training(200, 2_500, 50),
         },
-        evaluations=10,
-        starts=100,
-        average_last=3,
+        **_ON_A_CPU,
     ),
     # The same network before Muon, with condition tokens by an MLP, and trained for longer.
     "small_adamw": Preset(
@@ -123,9 +122,7 @@ PRESETS: dict[str, Preset] = {
             "xarm_arrange_blocks": Training(4_000, 40_000, 50),
             "xarm_tool_use": Training(1_000, 6_000, 50),
         },
-        evaluations=10,
-        starts=100,
-        average_last=3,
+        **_ON_A_CPU,
     ),
     # Before rotary positions and Muon became part of the preset `default`: the base of docs/ablations.md.
     "mini": Preset(
@@ -141,9 +138,7 @@ PRESETS: dict[str, Preset] = {
             "xarm_arrange_blocks": Training(1_000, 4_000, 50, _MINI_XARM),
             "xarm_tool_use": Training(400, 3_000, 50, _MINI_XARM),
         },
-        evaluations=10,
-        starts=100,
-        average_last=3,
+        **_ON_A_CPU,
     ),
     # The same with the paper's target, the noise, at half the learning rate (the paper's own, 1e-4, is for a hundred
     # times as many steps). HDP's weight of the symbols is the paper's, since the error of the noise is about ten times
@@ -157,9 +152,7 @@ PRESETS: dict[str, Preset] = {
             "optimizer_lr": 5e-4,
         },
         tasks=_TASKS_2D,
-        evaluations=10,
-        starts=100,
-        average_last=3,
+        **_ON_A_CPU,
         hdp_policy={"symbol_loss_weight": 1 / 30},
     ),
 }
