@@ -46,11 +46,11 @@ CHANGES: dict[str, dict[str, Any]] = {
         "optimizer_type": "muon",
         "optimizer_lr": 3e-3,
     },
-    "rotary=true, optimizer_type=muon, optimizer_lr=3e-3, start_share=0.3": {
+    "rotary=true, optimizer_type=muon, optimizer_lr=3e-3, lead_share=0.3": {
         "rotary": True,
         "optimizer_type": "muon",
         "optimizer_lr": 3e-3,
-        "start_share": 0.3,
+        "lead_share": 0.3,
     },
     "ema_max_decay=0": {"ema_max_decay": 0.0},
     "dropout=0.1": {"dropout": 0.1},
@@ -90,9 +90,9 @@ harm.
 has 16 %, after as many samples, with a network of about the same size. (`small` also has rotary positions, which
 alone have 19 % in the table.)
 
-**start_share** shows the planner more samples in which all is corrupted, where it decides which plan it makes. In
-arranging that is what is left to learn: which slot another block leaves no room to reach. It is no part of the preset,
-because it needs thousands of demonstrations: `small` has it in arranging, with 4,000.
+**lead_share** shows the planner more samples whose motion is pure noise, where the symbols decide which plan it makes.
+In arranging that is what is left to learn: which slot another block leaves no room to reach. It is no part of the
+preset, because it needs thousands of demonstrations: `small` has it in arranging, with 4,000.
 
 What is left of the failures in arranging is the plan itself, which takes a slot where another block leaves no room for
 the open gripper: [results](results.md) counts them.

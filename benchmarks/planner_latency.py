@@ -2,10 +2,10 @@
 
 python -m benchmarks.planner_latency
 
-Writes `benchmarks/results/planner_latency.json` and, from it, `docs/planner_latency.md`. Networks have the paper's size
-and random weights. Every round times each planner once, in a new order, so that whatever else the machine does falls on
-all of them; a ratio compares two times of the same round. A plan takes `--num_inference_steps` network calls on each
-level of a planner, fewer than the paper's 100: the ratios depend little on their number.
+Writes `benchmarks/results/planner_latency/DEVICE.json` and, from all of them, `docs/planner_latency.md`. Networks have
+the paper's size and random weights. Every round times each planner once, in a new order, so that whatever else the
+machine does falls on all of them; a ratio compares two times of the same round. A plan takes `--num_inference_steps`
+network calls on each level of a planner, fewer than the paper's 100: the ratios depend little on their number.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from .pages import DOCS, markdown_table
 from .paper.presets import ENVS, METHODS, PRESETS, make_cell
 from .timing import compare
 
-FILE, PAGE = RESULTS / "planner_latency.json", DOCS / "planner_latency.md"
+FILES, PAGE = RESULTS / "planner_latency", DOCS / "planner_latency.md"
 REFERENCE = "diffuser"
 
 
@@ -57,20 +57,12 @@ def measure(planners: dict[str, HDPPolicy], batch_size: int, rounds: int) -> dic
     return compare({name: partial(plan, planner) for name, planner in planners.items()}, rounds, REFERENCE)
 
 
-def write_page() -> None:
-    """Write the page from the results file."""
-    content = json.loads(FILE.read_text())
+def describe(content: dict) -> str:
+    """One device's part of the page."""
     run, result = content["run"], content["result"]
+    on_a_cpu = result["device"] == "cpu"
+    device = f"{run['cpu']}, {result['threads']} thread(s) of PyTorch" if on_a_cpu else run["gpu"]
     sizes = result["batch_size"]
-    lines = [
-        "# Size and latency of the planners",
-        "",
-        f"Written by `{run['command']}` (code of {run['git_commit']}) on {result['device']} ({run['cpu']}, "
-        f"{result['threads']} thread of PyTorch), for `{result['task']}`: {result['num_layers']} layers of width "
-        f"{result['width']}, {result['num_inference_steps']} steps a plan. Median and quartiles of {result['rounds']} "
-        "rounds; a ratio compares two times of the same round.",
-        "",
-    ]
     header, rows = ["planner", "parameters", "over Diffuser"], []
     for size in sizes:
         header += [f"batch {size}, ms", "over Diffuser"]
@@ -80,7 +72,19 @@ def write_page() -> None:
             for low, middle, high in (measured[name]["ms"], measured[name]["ratio"]):
                 cells.append(f"{middle:g} ({low:g} to {high:g})")
         rows.append(cells)
-    PAGE.write_text("\n".join([*lines, markdown_table(header, rows)]))
+    return (
+        f"## {device}\n\n"
+        f"For `{result['task']}`: {result['num_layers']} layers of width {result['width']}, "
+        f"{result['num_inference_steps']} steps a plan. Median and quartiles of {result['rounds']} rounds.\n\n"
+        f"{markdown_table(header, rows)}\n`{run['command']}`, code of {run['git_commit']}.\n"
+    )
+
+
+def write_page() -> None:
+    """Write the page from the results files."""
+    parts = [describe(json.loads(path.read_text())) for path in sorted(FILES.glob("*.json"))]
+    about = "Networks of the paper's size, with random weights. A ratio compares two times of the same round."
+    PAGE.write_text("\n".join(["# Size and latency of the planners\n", f"{about}\n", *parts]))
 
 
 def main() -> None:
@@ -114,7 +118,9 @@ def main() -> None:
         "parameter_ratio": {name: round(n / parameters[REFERENCE], 4) for name, n in parameters.items()},
         "batch_size": {size: measure(planners, size, options.rounds) for size in options.batch_sizes},
     }
-    FILE.write_text(json.dumps({"run": run, "result": result}, indent=2) + "\n")
+    FILES.mkdir(exist_ok=True)
+    content = json.dumps({"run": run, "result": result}, indent=2)
+    (FILES / f"{options.device}.json").write_text(content + "\n")
     write_page()
     print(PAGE.read_text())
 

@@ -15,18 +15,12 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
-from accelerate import Accelerator
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset, LeRobotDatasetMetadata
-from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.scripts.lerobot_train import update_policy
-from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
-from torch.utils.data import DataLoader
+from lerobot.datasets import LeRobotDataset
 
 import lerobot_policy_hdp  # noqa: F401 (registers the planners)
 from lerobot_hdp.in_memory_dataset import InMemoryDataset
@@ -34,38 +28,10 @@ from lerobot_hdp.in_memory_dataset import InMemoryDataset
 from .machine import RESULTS, describe_run
 from .pages import DOCS
 from .timing import quartiles, quartiles_of_ratio, take_turns
+from .training_step import describe_steps, endless, open_for_training, training_steps
 
 FILE = RESULTS / "training_speed.json"
 PAGE = DOCS / "training_speed.md"
-ON_A_GPU = """\
-## On a GPU
-
-Nothing of this has been measured on a GPU yet.
-
-What is there:
-
-- `--policy.dtype=bfloat16`: autocast in training and planning; weights, their average and the optimiser stay float32.
-- `--policy.compile_model=true`, with `--policy.compile_mode`: the denoiser through `torch.compile`.
-- Attention is PyTorch's `scaled_dot_product_attention`, with the kernel that PyTorch chooses.
-- AdamW is fused on CUDA; `--policy.optimizer_fused=false` switches that off. Muon (PyTorch's own) updates one matrix
-  after the other, some thousand small kernels a step; `--policy.optimizer_type=adamw` does without it.
-- The policy makes the host wait for the device once a step, for the losses in the log.
-
-What is not: the dataset stays in the host's memory, so each batch is copied, and the host waits for the copy. LeRobot's
-loop waits twice more in each step, for the loss and for the norm of the gradient, so that the device is idle while the
-host prepares what comes next.
-"""
-
-
-def endless(dataset: LeRobotDataset, batch_size: int, horizon: int) -> Iterator[dict]:
-    """Batches as LeRobot's training draws them, without workers."""
-    episodes = dataset.meta.episodes
-    sampler = EpisodeAwareSampler(
-        episodes["dataset_from_index"], episodes["dataset_to_index"], drop_n_last_frames=horizon - 1, shuffle=True
-    )
-    loader = DataLoader(dataset, batch_size, sampler=sampler)
-    while True:
-        yield from loader
 
 
 def data_path(dataset: LeRobotDataset, batch_size: int, horizon: int, rounds: int) -> dict[str, Any]:
@@ -84,31 +50,8 @@ def data_path(dataset: LeRobotDataset, batch_size: int, horizon: int, rounds: in
 
 
 def step_overhead(dataset: LeRobotDataset, config: PreTrainedConfig, batch_size: int, rounds: int) -> dict[str, Any]:
-    """A whole step of LeRobot's loop over the bare forward, backward and optimiser of the same policy."""
-    policy = make_policy(config, ds_meta=dataset.meta)
-    preprocessor, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
-    optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
-    scheduler = config.get_scheduler_preset().build(optimizer, 1000)
-    accelerator = Accelerator(cpu=True, mixed_precision={"bfloat16": "bf16", "float32": "no"}[config.dtype])
-    batches = endless(InMemoryDataset(dataset), batch_size, config.horizon)
-    policy, optimizer, scheduler = accelerator.prepare(policy, optimizer, scheduler)
-    names = ("loss", "grad_norm", "lr", "update_s")
-    meters = {name: AverageMeter(name) for name in names}
-    tracker = MetricsTracker(batch_size, dataset.num_frames, dataset.num_episodes, meters, accelerator=accelerator)
-    fixed = preprocessor(next(batches))
-
-    def whole() -> None:
-        batch = preprocessor(next(batches))
-        update_policy(tracker, policy, batch, optimizer, 10.0, accelerator=accelerator, lr_scheduler=scheduler)
-
-    def bare() -> None:
-        with accelerator.autocast():
-            loss, _ = policy.forward(fixed)
-        loss.backward()
-        optimizer.step()
-        optimizer.zero_grad()
-
-    policy.train()
+    """A whole step of LeRobot's loop over the bare one."""
+    whole, bare = training_steps(dataset, config, batch_size)
     times = take_turns({"bare": bare, "whole": whole}, rounds)
     return {
         "bare_s": quartiles(times["bare"]),
@@ -161,7 +104,7 @@ def write_page() -> None:
         f"{rates['hdp-train']:.0f} | {ratio(quartiles(commands['ratio']))} |\n\n"
         f"A whole step of `hdp-train` takes {ratio(step['ratio'])} times as long as the bare forward pass, backward "
         "pass and optimiser on a batch at hand, on one core. Less than 1 is what the measurement is wrong by.\n\n"
-        f"`{run['command']}`, code of {run['git_commit']}.\n\n{ON_A_GPU}"
+        f"`{run['command']}`, code of {run['git_commit']}.\n\n{describe_steps()}"
     )
 
 
@@ -180,9 +123,7 @@ def main() -> None:
 
     sizes = {name: getattr(options, name) for name in ("horizon", "num_layers", "width")}
     config = PreTrainedConfig.get_choice_class("hdp")(**sizes, dtype="bfloat16", device="cpu", push_to_hub=False)
-    meta = LeRobotDatasetMetadata(f"local/{options.root.name}", root=options.root)
-    windows = {"action": [i / meta.fps for i in range(options.horizon)]}
-    dataset = LeRobotDataset(meta.repo_id, root=options.root, delta_timestamps=windows)
+    dataset = open_for_training(options.root, options.horizon)
     flags = [
         "--policy.type=hdp",
         *(f"--policy.{name}={value}" for name, value in sizes.items()),

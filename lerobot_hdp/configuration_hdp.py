@@ -40,6 +40,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "optimizer_lr": 3e-3,
         "scheduler_warmup_steps": 100,
         "sampler": "confidence",
+        "symbol_lead": 0.5,
         "num_inference_steps": 10,
     },
     # The paper's values (Table "Transformer architecture hyperparameters" and those of Diffusion Policy, on which
@@ -55,6 +56,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "optimizer_lr": 1e-4,
         "scheduler_warmup_steps": 1000,
         "sampler": "ddpm",
+        "symbol_lead": 0.0,
     },
 }
 """Values of the fields that are None until a preset fills them."""
@@ -96,10 +98,10 @@ class HDPConfig(PreTrainedConfig):
             against the error of the noise; that of the clean motion is about ten times smaller.
         mask_schedule: how often training draws each level of masking: `linear`, all alike, or `cosine`, high ones more
             often and with less weight.
-        start_share: share of the training samples that are fully corrupted, motion and symbols, as a plan is where
-            sampling starts. There the planner decides which of several plans it makes, with nothing to go by but the
-            observation; independent levels show it next to no such samples. It needs thousands of demonstrations: of
-            a few hundred, the planner learns by heart which plan belongs to which start.
+        lead_share: share of the training samples whose motion is pure noise beside symbols at any level, as it is while
+            the symbols lead (`symbol_lead`). There the planner decides which of several plans it makes, with nothing to
+            go by but the observation; independent levels show it next to no such samples. It needs thousands of
+            demonstrations: of a few hundred, the planner learns by heart which plan belongs to which start.
         ema_power, ema_max_decay: the weights that plan are an exponential moving average with the decay
             min(1 - (1 + update)^-ema_power, ema_max_decay), as in Diffusion Policy. `ema_max_decay` 0 switches it off.
 
@@ -107,6 +109,9 @@ class HDPConfig(PreTrainedConfig):
             random. `ddim` draws the motion's noise at the start only. `confidence` does so too, and reveals symbols as
             soon as the planner is sure of them, which needs far fewer steps.
         confidence_threshold: how probable a symbol must be for the `confidence` sampler to reveal it.
+        symbol_lead: share of the network calls in which the masked symbols are revealed beside a motion that is still
+            pure noise. Without a lead, few steps let the motion choose a plan of its own before the symbols have made
+            up theirs. There is none where a part of the motion or all of the symbols are given.
         num_inference_steps: network calls for a plan; N where the preset says nothing else.
         prompt: a part of every plan, in words (prompt.py, docs/conditioning.md). None: what the environment asks for.
         num_candidates: plans that are drawn for each observation, of which the most likely is executed.
@@ -154,12 +159,13 @@ class HDPConfig(PreTrainedConfig):
     prediction_type: str | None = None
     symbol_loss_weight: float | None = None
     mask_schedule: str = "linear"
-    start_share: float = 0.0
+    lead_share: float = 0.0
     ema_power: float = 0.75
     ema_max_decay: float = 0.9999
 
     sampler: str | None = None
     confidence_threshold: float = 0.8
+    symbol_lead: float | None = None
     num_inference_steps: int | None = None
     prompt: str | None = None
     num_candidates: int = 1
@@ -207,11 +213,13 @@ class HDPConfig(PreTrainedConfig):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ParsingError(f"{name} must be at least 1, got {value}")
-        for name in ("dropout", "confidence_threshold", "start_share"):
+        for name in ("dropout", "confidence_threshold", "lead_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ParsingError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
-        if self.start_share and self.symbol_process is None:
-            raise ParsingError("start_share is about symbols, which this planner does not model: leave it at 0")
+        if not 0 <= self.symbol_lead < 1:
+            raise ParsingError(f"symbol_lead must be at least 0 and less than 1, got {self.symbol_lead}")
+        if self.lead_share and self.symbol_process is None:
+            raise ParsingError("lead_share is about symbols, which this planner does not model: leave it at 0")
         if self.width % self.num_heads or self.width % 2:
             raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
         if self.rotary and self.width // self.num_heads % 2:

@@ -199,8 +199,7 @@ class HDPPolicy(PreTrainedPolicy):
     ) -> tuple[Tensor, dict[str, float]]:
         motion = batch[ACTION]
         levels = self._sample_levels(self.motion_process, len(motion), generator)
-        at_start = self._samples_at_start(levels, generator)
-        levels = levels.masked_fill(at_start, 1.0)
+        levels = levels.masked_fill(self._symbols_lead(levels, generator), 1.0)
         noisy_motion = self._corrupt(self.motion_process, motion, levels, generator)
         observation, k_c = network.encoder(batch), noisy_motion.level
         if self.symbol_process is None:
@@ -209,7 +208,7 @@ class HDPPolicy(PreTrainedPolicy):
             return loss, read_losses(motion_loss=loss)
 
         if not self.config.shared_level:
-            levels = self._sample_levels(self.symbol_process, len(motion), generator).masked_fill(at_start, 1.0)
+            levels = self._sample_levels(self.symbol_process, len(motion), generator)
         corrupted_symbols = self._corrupt(self.symbol_process, batch[OBS_SYMBOLIC_PLAN], levels, generator)
         prediction = network.denoiser(
             noisy_motion.value, corrupted_symbols.value, observation, k_c, corrupted_symbols.level
@@ -219,11 +218,11 @@ class HDPPolicy(PreTrainedPolicy):
         loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
         return loss, read_losses(motion_loss=motion_loss, symbol_loss=symbol_loss)
 
-    def _samples_at_start(self, levels: Tensor, generator: Generator | None) -> Tensor:
-        """Which samples are fully corrupted, as a plan is where sampling starts: like levels, bool."""
-        if self.config.start_share == 0:
+    def _symbols_lead(self, levels: Tensor, generator: Generator | None) -> Tensor:
+        """In which samples the motion is pure noise, as in planning while the symbols lead: like levels, bool."""
+        if self.config.lead_share == 0:
             return torch.zeros_like(levels, dtype=torch.bool)
-        return torch.rand(len(levels), device=levels.device, generator=generator) < self.config.start_share
+        return torch.rand(len(levels), device=levels.device, generator=generator) < self.config.lead_share
 
     def _sample_levels(self, process: Process, batch_size: int, generator: Generator | None) -> Tensor:
         """Levels for the batches of all processes of a distributed run, (processes x B,); see `_corrupt`."""
@@ -389,6 +388,7 @@ class HDPPolicy(PreTrainedPolicy):
             self.config.symbolic_horizon or 0,
             self._device,
             self.config.num_inference_steps,
+            self.config.symbol_lead,
             self.config.shared_level,
             prompt,
             generator,

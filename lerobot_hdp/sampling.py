@@ -85,6 +85,7 @@ def sample_plan(
     symbolic_horizon: int,
     device: torch.device,
     num_steps: int,
+    symbol_lead: float = 0.0,
     shared_level: bool = False,
     prompt: PlanPrompt | None = None,
     generator: Generator | None = None,
@@ -104,6 +105,7 @@ def sample_plan(
         symbolic_horizon: H_d.
         device: where the plan is made.
         num_steps: number of calls of the denoiser.
+        symbol_lead: share of them in which the motion stays pure noise, while masked symbols are revealed; less than 1.
         shared_level: whether k_d is always k_c.
         prompt: the part of the plan that is given.
         generator: source of all randomness; None: PyTorch's global one.
@@ -111,21 +113,26 @@ def sample_plan(
     """
     prompt = prompt or PlanPrompt()
 
-    def start(process: Process, shape: tuple[int, ...], clean: Tensor | None, given: Tensor | None) -> Stream:
+    lead = _steps_ahead(prompt, symbol_lead, num_steps) if isinstance(symbol_process, MaskedProcess) else 0
+
+    def start(
+        process: Process, shape: tuple[int, ...], steps: int, clean: Tensor | None, given: Tensor | None
+    ) -> Stream:
         prior = process.prior(shape, device, generator)
-        stream = Stream(process, prior, process.levels(num_steps).to(device), clean, given, shared_level)
+        stream = Stream(process, prior, process.levels(steps).to(device), clean, given, shared_level)
         stream.set_given(0, generator)
         return stream
 
     batch_size = motion_shape[0]
-    motion = start(motion_process, motion_shape, prompt.actions, prompt.actions_mask)
+    motion = start(motion_process, motion_shape, num_steps - lead, prompt.actions, prompt.actions_mask)
     symbols: Stream | None = None
     tokens: Tensor | None = None
     probabilities = torch.zeros(batch_size, 0, device=device)
     k_d = torch.zeros(batch_size, device=device)
     not_pad = prompt.not_pad if isinstance(symbol_process, MaskedProcess) else None
     if symbol_process is not None:
-        symbols = start(symbol_process, (batch_size, symbolic_horizon), prompt.token_ids, prompt.tokens_mask)
+        shape = batch_size, symbolic_horizon
+        symbols = start(symbol_process, shape, num_steps, prompt.token_ids, prompt.tokens_mask)
         tokens = symbol_process.tokens(symbols.value)
         if isinstance(symbol_process, MaskedProcess):
             probabilities = (tokens != symbol_process.mask_id).float()
@@ -135,8 +142,10 @@ def sample_plan(
     for i in range(num_steps):
         if symbols is not None:
             k_d = symbols.level(i)
-        prediction = denoise(motion.value, symbols.value if symbols else None, motion.level(i), k_d)
-        motion.advance(i, prediction.motion, generator)
+        motion_step = max(i - lead, 0)
+        prediction = denoise(motion.value, symbols.value if symbols else None, motion.level(motion_step), k_d)
+        if i >= lead:
+            motion.advance(motion_step, prediction.motion, generator)
         if symbols is not None:
             assert symbol_process is not None
             assert prediction.symbols is not None
@@ -151,6 +160,16 @@ def sample_plan(
         if on_step is not None:
             on_step(i + 1, DenoisingState(motion.value, tokens, probabilities))
     return DenoisingState(motion.value, tokens, probabilities)
+
+
+def _steps_ahead(prompt: PlanPrompt, symbol_lead: float, num_steps: int) -> int:
+    """How many steps the symbols are ahead of the motion.
+
+    None where they have something to follow, a part of the motion that pure noise would hide, or nothing to decide.
+    """
+    if prompt.actions is not None or (prompt.tokens_mask is not None and bool(prompt.tokens_mask.all())):
+        return 0
+    return int(symbol_lead * num_steps)
 
 
 def _token_probabilities(logits: Tensor, tokens: Tensor) -> Tensor:

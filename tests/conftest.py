@@ -12,6 +12,7 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.parser import get_cli_overrides  # noqa: F401 (imports LeRobot once, before the timers of pytest)
+from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 
@@ -94,11 +95,27 @@ def batch(dataset):
 
 
 @pytest.fixture
+def training_batch(dataset):
+    """Training samples of four episodes, in the windows that a policy asks LeRobot for: `training_batch(policy)`."""
+
+    def load(policy):
+        windows = resolve_delta_timestamps(policy.config, dataset.meta)
+        windowed = LeRobotDataset("test/sorting", root=dataset.root, delta_timestamps=windows, video_backend="pyav")
+        return torch.utils.data.default_collate([windowed[episode * HORIZON] for episode in range(4)])
+
+    return load
+
+
+def observation(batch: dict) -> dict:
+    """What is observed, of a batch."""
+    return {key: value for key, value in batch.items() if key in ("observation.state", "observation.environment_state")}
+
+
+@pytest.fixture
 def inputs(make_planner, batch):
     """The preprocessed observations of the same."""
     _, preprocessor, _ = make_planner()
-    names = ("observation.state", "observation.environment_state")
-    return {name: value for name, value in preprocessor(batch).items() if name in names}
+    return observation(preprocessor(batch))
 
 
 def train_in_process(policy, inputs, steps: int) -> list[dict[str, float]]:

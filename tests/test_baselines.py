@@ -11,8 +11,6 @@ import torch.nn.functional as F
 from draccus.utils import ParsingError
 from huggingface_hub import ModelCard
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
-from lerobot.datasets.factory import resolve_delta_timestamps
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_eval, lerobot_train
@@ -23,28 +21,12 @@ from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp import PlanPrompt
 from lerobot_hdp.prompt import encode_prompt
 
-from .conftest import HORIZON, TASK_FLAGS, TINY_PLANNER, train_in_process
+from .conftest import HORIZON, TASK_FLAGS, TINY_PLANNER, observation, train_in_process
 
 CONTINUOUS_SYMBOLS = ["joint_diffuser", "separate_diffuser"]
 WITH_SYMBOLS = ["hdp", *CONTINUOUS_SYMBOLS]
 HIERARCHICAL = ["hd", "chd"]
 PLANNERS = [*WITH_SYMBOLS, "diffuser", *HIERARCHICAL]
-
-
-def observation(batch):
-    return {key: value for key, value in batch.items() if key in ("observation.state", "observation.environment_state")}
-
-
-@pytest.fixture
-def training_batch(dataset):
-    """Training samples of four episodes, in the windows that a policy asks LeRobot for: `training_batch(policy)`."""
-
-    def load(policy):
-        windows = resolve_delta_timestamps(policy.config, dataset.meta)
-        windowed = LeRobotDataset("test/sorting", root=dataset.root, delta_timestamps=windows, video_backend="pyav")
-        return torch.utils.data.default_collate([windowed[episode * HORIZON] for episode in range(4)])
-
-    return load
 
 
 class HostReads(TorchDispatchMode):

@@ -1,5 +1,7 @@
 """The planner as a LeRobot policy, in one process. What all planners share is tested in test_baselines.py."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 from draccus.utils import ParsingError
@@ -14,11 +16,7 @@ from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.processor_hdp import SymbolicPlanProcessorStep
 from lerobot_hdp.prompt import encode_prompt
 
-from .conftest import HORIZON, TINY_PLANNER, train_in_process
-
-
-def observation(batch):
-    return {key: value for key, value in batch.items() if key in ("observation.state", "observation.environment_state")}
+from .conftest import HORIZON, TINY_PLANNER, observation, train_in_process
 
 
 def test_sizes_and_vocabulary_come_from_the_dataset(make_planner):
@@ -123,18 +121,20 @@ def test_both_losses_fall_in_training(make_planner, batch):
         assert last < 0.7 * first
 
 
-@pytest.mark.parametrize("start_share", [0.0, 1.0])
+@pytest.mark.parametrize("lead_share", [0.0, 1.0])
 @pytest.mark.parametrize("policy_type", ["hdp", "separate_diffuser", "joint_diffuser"])
-def test_training_shows_the_start_of_sampling_as_often_as_it_is_told(make_planner, batch, policy_type, start_share):
-    policy, preprocessor, _ = make_planner(policy_type, start_share=start_share)
+def test_training_shows_symbols_that_lead_as_often_as_it_is_told(make_planner, batch, policy_type, lead_share):
+    policy, preprocessor, _ = make_planner(policy_type, lead_share=lead_share)
     seen = []
-    policy.planner.denoiser.register_forward_pre_hook(lambda _, inputs: seen.append(inputs))
+    policy.planner.denoiser.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[-2:]))
     for _ in range(5):
         policy.train().forward(preprocessor(batch))
-    starts = [bool((k_c == 1).all() and (k_d == 1).all()) for *_, k_c, k_d in seen]
-    assert all(starts) if start_share else not any(starts)
-    if policy_type == "hdp" and start_share:
-        assert all((symbols == policy.symbol_process.mask_id).all() for _, symbols, *_ in seen)
+    motion_levels, symbol_levels = (torch.stack(levels) for levels in zip(*seen, strict=True))
+    assert (motion_levels == 1).all() == bool(lead_share)
+    if policy_type == "joint_diffuser":
+        assert torch.equal(symbol_levels, motion_levels)
+    else:
+        assert symbol_levels.min() < 0.5
 
 
 def test_a_plan_is_whole_and_holds_no_mask(make_planner, batch):
@@ -156,6 +156,45 @@ def test_the_number_of_network_calls_is_the_users_choice(make_planner, batch, sa
     policy.eval()._planning_network.denoiser.register_forward_hook(lambda *_: calls.append(1))
     policy.plan(observation(preprocessor(batch)))
     assert len(calls) == num_inference_steps
+
+
+def motion_moves(policy, inputs, prompt=None):
+    """Of each network call, whether it moves the motion."""
+    motions = []
+    policy.eval().plan(inputs, prompt, on_step=lambda _, state: motions.append(state.motion))
+    return [not torch.equal(before, after) for before, after in pairwise(motions)]
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "confidence"])
+def test_symbols_lead_a_motion_that_is_pure_noise(make_planner, batch, sampler):
+    policy, preprocessor, _ = make_planner(sampler=sampler, num_inference_steps=10, symbol_lead=0.3)
+    inputs, levels = observation(preprocessor(batch)), []
+    policy._planning_network.denoiser.register_forward_pre_hook(
+        lambda _, arguments: levels.append((arguments[3].max().item(), arguments[4].min().item()))
+    )
+    assert motion_moves(policy, inputs) == [False] * 3 + [True] * 7
+    assert [k_c for k_c, _ in levels[:4]] == [1.0] * 4
+    assert levels[4][0] < 1
+    assert levels[3][1] < levels[0][1] == 1  # symbols have been revealed meanwhile
+
+
+def test_symbols_that_have_something_to_follow_do_not_lead(make_planner, batch):
+    policy, preprocessor, _ = make_planner(num_inference_steps=4, symbol_lead=0.5)
+    inputs = preprocessor(batch)
+    given = torch.zeros(inputs["action"].shape[:2], dtype=torch.bool)
+    given[:, :3] = True
+    part_of_motion = PlanPrompt(actions=inputs["action"], actions_given=given)
+    all_symbols = PlanPrompt(token_ids=inputs["observation.symbolic_plan"])
+    some_symbols = PlanPrompt(token_ids=encode_prompt("PICK _ S1 PLACE", policy.vocabulary, 18).expand(4, -1))
+    assert motion_moves(policy, observation(inputs), part_of_motion) == [True] * 4
+    assert motion_moves(policy, observation(inputs), all_symbols) == [True] * 4
+    assert motion_moves(policy, observation(inputs), some_symbols) == [False, False, True, True]
+
+
+@pytest.mark.parametrize("planner", ["diffuser", "joint_diffuser", "separate_diffuser"])
+def test_without_masked_symbols_nothing_leads(make_planner, batch, planner):
+    policy, preprocessor, _ = make_planner(planner, num_inference_steps=4, symbol_lead=0.5)
+    assert motion_moves(policy, observation(preprocessor(batch))) == [True] * 4
 
 
 def test_given_symbols_stay_fixed_in_every_step(make_planner, batch):
@@ -489,6 +528,8 @@ class TestBadInput:
             {"num_heads": 0},
             {"dropout": 1.5},
             {"confidence_threshold": -1.0},
+            {"symbol_lead": 1.0},
+            {"symbol_lead": -0.1},
             {"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}},
             {"num_inference_steps": 101},
             {"num_candidates": 0},

@@ -1,7 +1,7 @@
 """What is trained for each preset, task and method: the cells of `python -m benchmarks.paper`."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
@@ -67,13 +67,15 @@ def _steps(epochs: int, demonstrations: int, batch_size: int) -> int:
 _MINI_2D = {"num_layers": 5, "width": 112, "num_inference_steps": 20}
 _ON_A_CPU: dict[str, Any] = {"evaluations": 10, "starts": 100, "average_last": 3}
 _MINI_XARM = {"num_layers": 4, "width": 128}
-_BEFORE_MUON = {"rotary": False, "optimizer_type": "adamw"}
-_MANY_DEMONSTRATIONS = {"start_share": 0.3}
+_ADAMW = {"optimizer_type": "adamw", "symbol_lead": 0.0}
+_LEARNED_POSITIONS_ADAMW = {"rotary": False, **_ADAMW}
+_MANY_DEMONSTRATIONS = {"lead_share": 0.3}
 _TASKS_2D = {
-    "block_sorting_2d_2_blocks": Training(200, steps=1000, batch_size=50, policy=_MINI_2D),
-    "block_sorting_2d_3_blocks": Training(200, steps=1500, batch_size=50, policy=_MINI_2D),
-    "block_sorting_2d_4_blocks": Training(200, steps=2500, batch_size=50, policy=_MINI_2D),
+    "block_sorting_2d_2_blocks": Training(200, 1_000, 50),
+    "block_sorting_2d_3_blocks": Training(200, 1_500, 50),
+    "block_sorting_2d_4_blocks": Training(200, 2_500, 50),
 }
+_MINI_TASKS_2D = {task: replace(training, policy=_MINI_2D) for task, training in _TASKS_2D.items()}
 PRESETS: dict[str, Preset] = {
     # The paper's hyperparameters and sampler: 100 network calls, weights averaged, the mean over 10 checkpoints.
     "paper": Preset(
@@ -89,9 +91,12 @@ PRESETS: dict[str, Preset] = {
         policy={"preset": "default", "dtype": "bfloat16"},
         tasks={
             "xarm_sorting": Training(200, 2_400, 50),
-            "xarm_arrange_blocks": Training(4_000, 10_000, 50, _MANY_DEMONSTRATIONS),
+            "xarm_arrange_blocks": Training(4_000, 5_000, 50, _MANY_DEMONSTRATIONS),
             "xarm_tool_use": Training(400, 2_000, 50),
+            **_TASKS_2D,
         },
+        evaluations=10,
+        average_last=3,
     ),
     # `default` with a network of a tenth of the size, and as much training as a CPU core carries in half an hour.
     "small": Preset(
@@ -100,18 +105,16 @@ PRESETS: dict[str, Preset] = {
             "xarm_sorting": Training(200, 2_400, 50),
             "xarm_arrange_blocks": Training(4_000, 5_000, 50, _MANY_DEMONSTRATIONS),
             "xarm_tool_use": Training(400, 2_000, 50),
-            "block_sorting_2d_2_blocks": Training(200, 1_000, 50),
-            "block_sorting_2d_3_blocks": Training(200, 1_500, 50),
-            "block_sorting_2d_4_blocks": Training(200, 2_500, 50),
+            **_TASKS_2D,
         },
         **_ON_A_CPU,
     ),
-    # The same network before Muon, with condition tokens by an MLP, and trained for longer.
+    # The same network before Muon and `symbol_lead`, with condition tokens by an MLP, and trained for longer.
     "small_adamw": Preset(
         policy={
             "preset": "default",
             "dtype": "bfloat16",
-            "optimizer_type": "adamw",
+            **_ADAMW,
             "optimizer_lr": 1e-3,
             "state_encoder_hidden_dim": 256,
             "observation_weight_std": 2.0,
@@ -124,16 +127,16 @@ PRESETS: dict[str, Preset] = {
         },
         **_ON_A_CPU,
     ),
-    # Before rotary positions and Muon became part of the preset `default`: the base of docs/ablations.md.
+    # Before rotary positions, Muon and `symbol_lead` were part of the preset `default`: the base of docs/ablations.md.
     "mini": Preset(
         policy={
             "preset": "default",
             "dtype": "bfloat16",
-            **_BEFORE_MUON,
+            **_LEARNED_POSITIONS_ADAMW,
             "optimizer_lr": 1e-3,
         },
         tasks={
-            **_TASKS_2D,
+            **_MINI_TASKS_2D,
             "xarm_sorting": Training(200, 3_000, 50, _MINI_XARM),
             "xarm_arrange_blocks": Training(1_000, 4_000, 50, _MINI_XARM),
             "xarm_tool_use": Training(400, 3_000, 50, _MINI_XARM),
@@ -147,11 +150,11 @@ PRESETS: dict[str, Preset] = {
         policy={
             "preset": "default",
             "dtype": "bfloat16",
-            **_BEFORE_MUON,
+            **_LEARNED_POSITIONS_ADAMW,
             "prediction_type": "epsilon",
             "optimizer_lr": 5e-4,
         },
-        tasks=_TASKS_2D,
+        tasks=_MINI_TASKS_2D,
         **_ON_A_CPU,
         hdp_policy={"symbol_loss_weight": 1 / 30},
     ),
@@ -171,7 +174,7 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
     if method == "hdp":
         policy |= preset.hdp_policy
     if PreTrainedConfig.get_choice_class(method).symbol_process is None:
-        for about_symbols in ("symbolic_horizon", "start_share"):
+        for about_symbols in ("symbolic_horizon", "lead_share", "symbol_lead"):
             policy.pop(about_symbols, None)
     return Cell(
         group=f"paper/{preset_name}",

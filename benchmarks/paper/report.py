@@ -212,23 +212,22 @@ def adherence() -> str:
 
 
 def latency() -> str:
-    """Time of a plan over Diffuser's."""
-    path = RESULTS / "planner_latency.json"
-    if not path.exists():
+    """Time of a plan over Diffuser's, on each device."""
+    contents = [json.loads(path.read_text()) for path in sorted((RESULTS / "planner_latency").glob("*.json"))]
+    if not contents:
         return f"{MISSING}: `python -m benchmarks.planner_latency`\n"
-    content = json.loads(path.read_text())
-    result, sizes = content["result"], content["result"]["batch_size"]
-    rows = []
-    for method in METHODS:
-        theirs = published.LATENCY_OVER_DIFFUSER.get(method)
-        ours = [f"{100 * (measured[method]['ratio'][1] - 1):+.0f} %" for measured in sizes.values()]
-        rows.append([LABELS[method], "" if theirs is None else f"+{theirs} %", *ours])
-    header = ["over Diffuser, at as many network calls", "paper", *(f"ours, batch {size}" for size in sizes)]
+    theirs = published.LATENCY_OVER_DIFFUSER
+    columns = {"paper": {method: f"+{theirs[method]} %" for method in METHODS if method in theirs}}
+    for content in contents:
+        device = content["run"]["gpu"] if content["result"]["device"] == "cuda" else content["run"]["cpu"]
+        for size, measured in content["result"]["batch_size"].items():
+            ratios = {method: measured[method]["ratio"][1] for method in METHODS}
+            columns[f"{device}, batch {size}"] = {name: f"{100 * (ratio - 1):+.0f} %" for name, ratio in ratios.items()}
+    rows = [[LABELS[method], *(column.get(method, "") for column in columns.values())] for method in METHODS]
     return (
-        f"{markdown_table(header, rows)}\n{result['num_layers']} layers of width {result['width']}, on "
-        f"{content['run']['gpu'] or content['run']['cpu']}; medians ([spread](planner_latency.md)). "
-        f"`{content['run']['command']}`\n\nOn a CPU, time goes with the number of tokens: in the paper's setting HDP "
-        "has 108 more, most of them PAD; without padding (`--preset default`) 36.\n"
+        f"{markdown_table(['over Diffuser, at as many network calls', *columns], rows)}\n"
+        "Medians ([milliseconds, spread and commands](planner_latency.md)). On a CPU, time goes with the number of "
+        "tokens: in the paper's setting HDP has 108 more, most of them PAD; without padding (`--preset default`) 36.\n"
     )
 
 
