@@ -173,9 +173,12 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
     policy = {"type": method, **preset.policy, **training.policy}
     if method == "hdp":
         policy |= preset.hdp_policy
-    if PreTrainedConfig.get_choice_class(method).symbol_process is None:
-        for about_symbols in ("symbolic_horizon", "lead_share", "symbol_lead"):
-            policy.pop(about_symbols, None)
+    process = PreTrainedConfig.get_choice_class(method).symbol_process
+    if process is None:
+        policy.pop("symbolic_horizon", None)
+        policy.pop("symbol_lead", None)
+    if process != "masked":
+        policy.pop("lead_share", None)
     return Cell(
         group=f"paper/{preset_name}",
         name=f"{task}_{method}_seed{seed}",
