@@ -197,7 +197,7 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
 
 def stage(preset: str, method: str, task: str) -> int:
     """What of a seed is run before what: HDP as it is meant to be used, Diffuser beside it, then the paper's HDP."""
-    if preset == "default" and method in ("hdp", "diffuser"):
+    if preset == "default" and method in ("hdp", "diffuser") and task not in _TASKS_2D:
         return ("hdp", "diffuser").index(method)
     return 2 if (preset, method, task) == ("paper", "hdp", "xarm_sorting") else 3
 
