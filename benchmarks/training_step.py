@@ -89,7 +89,7 @@ def training_steps(
     accelerator = Accelerator(cpu=config.device == "cpu", mixed_precision="bf16", kwargs_handlers=[autocast])
     batches = endless(InMemoryDataset(dataset), batch_size, config.horizon)
     policy, optimizer, scheduler = accelerator.prepare(policy, optimizer, scheduler)
-    names = ("loss", "grad_norm", "lr", "update_s")
+    names = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")
     meters = {name: AverageMeter(name) for name in names}
     tracker = MetricsTracker(batch_size, dataset.num_frames, dataset.num_episodes, meters, accelerator=accelerator)
     fixed = preprocessor(next(batches))
