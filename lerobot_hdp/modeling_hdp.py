@@ -4,7 +4,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import numpy as np
@@ -25,9 +25,9 @@ from .optimizer import parameter_groups
 from .plan import Plan, PlanCheck, PlanPrompt
 from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess, Process, SymbolProcess
 from .processor_hdp import widen_narrow_ranges
-from .prompt import choose_placement, encode_prompt, shared_tokens
+from .prompt import place_prompts
 from .sampling import Denoise, DenoisingState, sample_plan
-from .vocabulary import FREE, FREE_SYMBOL, PAD_ID, Vocabulary
+from .vocabulary import PAD_ID, Vocabulary
 
 
 def _without_dropout[**P, R](method: Callable[P, R]) -> Callable[P, R]:
@@ -283,7 +283,7 @@ class HDPPolicy(PreTrainedPolicy):
         inputs = [key for key in (*self.config.input_features, OBS_SYMBOLIC_PLAN) if key in batch]
         repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in inputs}
         if isinstance(prompt, PlanPrompt):
-            self._check_prompt(prompt, self._batch_size(batch))
+            prompt.check(self._motion_shape(batch), self._symbols_shape(batch), self.vocabulary)
             prompt = prompt.repeat(k)
         elif prompt is not None:
             prompt = [text for text in _one_text_each(prompt, self._batch_size(batch)) for _ in range(k)]
@@ -344,34 +344,34 @@ class HDPPolicy(PreTrainedPolicy):
         if prompt is None:
             return PlanPrompt()
         if not isinstance(prompt, PlanPrompt):
+            if self.vocabulary is None:
+                raise ValueError("this planner models no symbols: it takes no symbolic prompt")
             texts = _one_text_each(prompt, self._batch_size(batch))
-            prompt = PlanPrompt(token_ids=self._place_words(batch, texts, generator))
+            ask = partial(self._ask_for_symbols, batch, generator)
+            length = self.config.symbolic_horizon
+            prompt = PlanPrompt(token_ids=place_prompts(texts, self.vocabulary, length, self._device, ask, generator))
         prompt = prompt.to(self._device)
-        self._check_prompt(prompt, self._batch_size(batch))
+        prompt.check(self._motion_shape(batch), self._symbols_shape(batch), self.vocabulary)
         return prompt
 
-    def _place_words(self, batch: dict[str, Tensor], texts: list[str], generator: Generator | None) -> Tensor:
-        """Token ids of a prompt in words for each sample: (B, H_d)."""
-        if self.symbol_process is None:
-            raise ValueError("this planner models no symbols: it takes no symbolic prompt")
-        length = self.config.symbolic_horizon
-        encoded = {text: encode_prompt(text, self.vocabulary, length).to(self._device) for text in set(texts)}
-        placements = [encoded[text] for text in texts]
-        if all(len(ways) == 1 for ways in placements):
-            return torch.cat(placements)
+    def _ask_for_symbols(self, batch: dict[str, Tensor], generator: Generator | None, given: Tensor) -> Tensor:
+        """Scores of all symbols where a plan begins, pure noise and masks, beside what is given: (B, H_d, m).
+
+        Args:
+            batch: preprocessed observations.
+            generator: source of randomness.
+            given: (B, H_d) token ids, masked where they are FREE or FREE_SYMBOL.
+        """
         if not isinstance(self.symbol_process, MaskedProcess):
             raise ValueError(
                 "this planner cannot decide where in a plan words stand, after '...' or from its end: number their "
                 "positions from the start, as in 11:STACK"
             )
-        # The most corrupted plan, with what is given in any case: its symbols' probabilities are those of the places.
-        given = torch.stack([shared_tokens(ways) for ways in placements])
-        tokens = given.masked_fill(given < PAD_ID, self.symbol_process.mask_id)
+        free = given < PAD_ID
         motion = self.motion_process.prior(self._motion_shape(batch), self._device, generator)
-        k_c = torch.ones(len(texts), device=self._device)
-        logits = self._denoiser(batch)(motion, tokens, k_c, (given < PAD_ID).float().mean(dim=1)).symbols
-        drawn = zip(placements, logits, strict=True)
-        return torch.stack([choose_placement(ways, scores, generator) for ways, scores in drawn])
+        k_c, k_d = torch.ones(len(given), device=self._device), free.float().mean(dim=1)
+        tokens = given.masked_fill(free, self.symbol_process.mask_id)
+        return self._denoiser(batch)(motion, tokens, k_c, k_d).symbols
 
     def _sample(
         self,
@@ -445,21 +445,9 @@ class HDPPolicy(PreTrainedPolicy):
         """(B, H_c, D)."""
         return self._batch_size(batch), self.config.horizon, self.config.action_feature.shape[0]
 
-    def _check_prompt(self, prompt: PlanPrompt, batch_size: int) -> None:
-        shape = batch_size, self.config.horizon, self.config.action_feature.shape[0]
-        if prompt.token_ids is not None:
-            if self.symbol_process is None:
-                raise ValueError("this planner models no symbols: it takes no symbolic prompt")
-            _check_tensor("token_ids", prompt.token_ids, (batch_size, self.config.symbolic_horizon), torch.int64)
-            size = len(self.config.vocabulary)
-            if ((prompt.token_ids < FREE_SYMBOL) | (prompt.token_ids >= size)).any():
-                raise ValueError(f"token_ids must be in [0, {size - 1}], or {FREE} or {FREE_SYMBOL}, see PlanPrompt")
-        if prompt.actions is not None:
-            _check_tensor("actions", prompt.actions, shape, torch.float32)
-            if not prompt.actions.isfinite().all():
-                raise ValueError("actions hold NaN or infinity")
-        if prompt.actions_given is not None:
-            _check_tensor("actions_given", prompt.actions_given, shape[:2], torch.bool)
+    def _symbols_shape(self, batch: dict[str, Tensor]) -> tuple[int, int] | None:
+        """(B, H_d); None where no symbols are modelled."""
+        return None if self.symbol_process is None else (self._batch_size(batch), self.config.symbolic_horizon)
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
         """The README.md that goes to the Hub with the weights: LeRobot's, and what this planner is."""
@@ -521,13 +509,6 @@ def _one_text_each(prompt: str | Sequence[str], batch_size: int) -> list[str]:
     if len(texts) != batch_size:
         raise ValueError(f"there are {len(texts)} prompts for {batch_size} observations")
     return texts
-
-
-def _check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
-    if tuple(tensor.shape) != shape or tensor.dtype != dtype:
-        raise ValueError(
-            f"{name} must have the shape {shape} and the type {dtype}, got {tuple(tensor.shape)} and {tensor.dtype}"
-        )
 
 
 def _rank_and_world_size() -> tuple[int, int]:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .vocabulary import FREE_SYMBOL, PAD_ID, Vocabulary
+from .vocabulary import FREE, FREE_SYMBOL, PAD_ID, Vocabulary
 
 PlanCheck = Callable[[int, list[str]], list[str]]
 """(index of the sample, its plan in words) -> complaints about the plan, in words; none about a valid one."""
@@ -66,6 +66,33 @@ class PlanPrompt:
             return False
         return bool((self.actions_given.any(dim=1) & ~self.actions_given.all(dim=1)).any())
 
+    def check(
+        self, motion_shape: tuple[int, int, int], symbols_shape: tuple[int, int] | None, vocabulary: Vocabulary | None
+    ) -> None:
+        """Refuse what does not fit a planner.
+
+        Args:
+            motion_shape: (B, H_c, D).
+            symbols_shape: (B, H_d).
+            vocabulary: of the planner; like `symbols_shape`, None where it models no symbols.
+
+        Raises:
+            ValueError: a tensor of another shape or type, unknown token ids, or NaN.
+        """
+        if self.token_ids is not None:
+            if symbols_shape is None or vocabulary is None:
+                raise ValueError("this planner models no symbols: it takes no symbolic prompt")
+            _check_tensor("token_ids", self.token_ids, symbols_shape, torch.int64)
+            size = len(vocabulary)
+            if ((self.token_ids < FREE_SYMBOL) | (self.token_ids >= size)).any():
+                raise ValueError(f"token_ids must be in [0, {size - 1}], or {FREE} or {FREE_SYMBOL}, see PlanPrompt")
+        if self.actions is not None:
+            _check_tensor("actions", self.actions, motion_shape, torch.float32)
+            if not self.actions.isfinite().all():
+                raise ValueError("actions hold NaN or infinity")
+        if self.actions_given is not None:
+            _check_tensor("actions_given", self.actions_given, motion_shape[:2], torch.bool)
+
     def repeat(self, times: int) -> "PlanPrompt":
         """Each sample's prompt `times` times, one after the other: (B times, ...)."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -75,6 +102,13 @@ class PlanPrompt:
         """The same on a device."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         return PlanPrompt(**{name: None if value is None else value.to(device) for name, value in given.items()})
+
+
+def _check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    if tuple(tensor.shape) != shape or tensor.dtype != dtype:
+        raise ValueError(
+            f"{name} must have the shape {shape} and the type {dtype}, got {tuple(tensor.shape)} and {tensor.dtype}"
+        )
 
 
 def _repeat(value: Tensor | None, times: int) -> Tensor | None:

@@ -15,7 +15,7 @@ choice, too. So a prompt is a list of placements, and the planner draws one (`ch
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -87,6 +87,37 @@ def encode_prompt(prompt: str, vocabulary: Vocabulary, length: int) -> Tensor:
             f"the prompt '{prompt}' can be placed in too many ways: give positions by number, as in 7:PICK"
         )
     return torch.tensor(rows)
+
+
+def place_prompts(
+    texts: Sequence[str],
+    vocabulary: Vocabulary,
+    length: int,
+    device: torch.device,
+    ask: Callable[[Tensor], Tensor],
+    generator: Generator | None = None,
+) -> Tensor:
+    """Token ids of a prompt in words for each sample of a batch: (B, H_d).
+
+    Args:
+        texts: B prompts.
+        vocabulary: of the planner.
+        length: H_d.
+        device: of the token ids.
+        ask: from what is given in any case, (B, H_d) token ids, to a planner's scores of all symbols (B, H_d, m). It
+            is asked only if the words do not say where they stand.
+        generator: source of randomness; None: PyTorch's global one.
+
+    Raises:
+        ValueError: see `encode_prompt`.
+    """
+    encoded = {text: encode_prompt(text, vocabulary, length).to(device) for text in set(texts)}
+    placements = [encoded[text] for text in texts]
+    if all(len(ways) == 1 for ways in placements):
+        return torch.cat(placements)
+    scores = ask(torch.stack([shared_tokens(ways) for ways in placements]))
+    drawn = zip(placements, scores, strict=True)
+    return torch.stack([choose_placement(ways, logits, generator) for ways, logits in drawn])
 
 
 def shared_tokens(placements: Tensor) -> Tensor:
