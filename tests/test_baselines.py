@@ -178,6 +178,15 @@ class TestContract:
         played = torch.stack([policy.select_action(inputs) for _ in range(HORIZON)], dim=1)
         assert torch.equal(played, plan)
 
+    @pytest.mark.parametrize("ema_max_decay", [0.0, 0.9999])
+    def test_planning_has_no_dropout_even_while_the_policy_trains(self, make_planner, batch, planner, ema_max_decay):
+        policy, preprocessor, _ = make_planner(planner, dropout=0.5, ema_max_decay=ema_max_decay)
+        inputs = observation(preprocessor(batch))
+        plans = [policy.train().plan(inputs, generator=torch.Generator().manual_seed(0)) for _ in range(2)]
+        assert torch.equal(plans[0].actions, plans[1].actions)
+        assert policy.training
+        assert policy.planner.training
+
     def test_the_beginning_of_the_motion_can_be_given(self, make_planner, batch, planner):
         policy, preprocessor, _ = make_planner(planner)
         inputs = preprocessor(batch)

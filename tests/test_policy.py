@@ -292,15 +292,6 @@ def test_an_open_prompt_stays_open_where_it_is_filled(make_planner, batch):
     assert not policy.read_prompt(inputs).not_pad[:, 1:].any()
 
 
-@pytest.mark.parametrize("ema_max_decay", [0.0, 0.9999])
-def test_planning_has_no_dropout_even_while_the_policy_trains(make_planner, inputs, ema_max_decay):
-    policy, *_ = make_planner(dropout=0.5, ema_max_decay=ema_max_decay)
-    plans = [policy.train().plan(observation(inputs), generator=torch.Generator().manual_seed(0)) for _ in range(2)]
-    assert torch.equal(plans[0].actions, plans[1].actions)
-    assert policy.training
-    assert policy.planner.training
-
-
 def test_planning_uses_the_moving_average_of_the_weights(make_planner, batch):
     policy, preprocessor, _ = make_planner()
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
