@@ -86,7 +86,7 @@ use has 71 % on average where learned positions have 61 %
 harm.
 
 **Muon** for the hidden layers, at a learning rate of 3e-3, is the largest step since the clean motion. The
-[results](results.md) of the preset `small` have it, and those of `mini` do not: sorting four blocks, 76 % where `mini`
+[results](results.md) of the preset `small` have it, and those of `mini` do not: sorting four blocks, 73 % where `mini`
 has 16 %, after as many samples, with a network of about the same size. (`small` also has rotary positions, which
 alone have 19 % in the table.)
 
