@@ -4,13 +4,14 @@ import os
 import platform
 import subprocess
 import sys
-from importlib.metadata import version
+from importlib import import_module
 from pathlib import Path
 
 import torch
 
 REPOSITORY = Path(__file__).parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"
+PACKAGES = ("lerobot", "torch", "gymnasium", "mujoco", "numpy")
 
 
 def describe_run() -> dict[str, object]:
@@ -22,7 +23,7 @@ def describe_run() -> dict[str, object]:
         "cores": os.cpu_count(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "python": platform.python_version(),
-        "packages": {name: version(name) for name in ("lerobot", "torch", "gymnasium", "mujoco", "numpy")},
+        "packages": {name: import_module(name).__version__ for name in PACKAGES},
     }
 
 

@@ -67,8 +67,8 @@ def _steps(epochs: int, demonstrations: int, batch_size: int) -> int:
 _MINI_2D = {"num_layers": 5, "width": 112, "num_inference_steps": 20}
 _ON_A_CPU: dict[str, Any] = {"evaluations": 10, "starts": 100, "average_last": 3}
 _MINI_XARM = {"num_layers": 4, "width": 128}
-_ADAMW = {"optimizer_type": "adamw", "symbol_lead": 0.0}
-_LEARNED_POSITIONS_ADAMW = {"rotary": False, **_ADAMW}
+_BEFORE_MUON = {"optimizer_type": "adamw", "symbol_lead": 0.0}
+_AT_FIRST = {"rotary": False, **_BEFORE_MUON}
 _MANY_DEMONSTRATIONS = {"lead_share": 0.3}
 _TASKS_2D = {
     "block_sorting_2d_2_blocks": Training(200, 1_000, 50),
@@ -114,7 +114,7 @@ PRESETS: dict[str, Preset] = {
         policy={
             "preset": "default",
             "dtype": "bfloat16",
-            **_ADAMW,
+            **_BEFORE_MUON,
             "optimizer_lr": 1e-3,
             "state_encoder_hidden_dim": 256,
             "observation_weight_std": 2.0,
@@ -132,7 +132,7 @@ PRESETS: dict[str, Preset] = {
         policy={
             "preset": "default",
             "dtype": "bfloat16",
-            **_LEARNED_POSITIONS_ADAMW,
+            **_AT_FIRST,
             "optimizer_lr": 1e-3,
         },
         tasks={
@@ -150,7 +150,7 @@ PRESETS: dict[str, Preset] = {
         policy={
             "preset": "default",
             "dtype": "bfloat16",
-            **_LEARNED_POSITIONS_ADAMW,
+            **_AT_FIRST,
             "prediction_type": "epsilon",
             "optimizer_lr": 5e-4,
         },
