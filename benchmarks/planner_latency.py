@@ -57,11 +57,20 @@ def measure(planners: dict[str, HDPPolicy], batch_size: int, rounds: int) -> dic
     return compare({name: partial(plan, planner) for name, planner in planners.items()}, rounds, REFERENCE)
 
 
+def read_results() -> list[dict]:
+    """The contents of the results files, one for each device."""
+    return [json.loads(path.read_text()) for path in sorted(FILES.glob("*.json"))]
+
+
+def device_name(content: dict) -> str:
+    """What a results file was measured on."""
+    return content["run"]["cpu" if content["result"]["device"] == "cpu" else "gpu"]
+
+
 def describe(content: dict) -> str:
     """One device's part of the page."""
     run, result = content["run"], content["result"]
-    on_a_cpu = result["device"] == "cpu"
-    device = f"{run['cpu']}, {result['threads']} thread(s) of PyTorch" if on_a_cpu else run["gpu"]
+    threads = f", {result['threads']} thread(s) of PyTorch" if result["device"] == "cpu" else ""
     sizes = result["batch_size"]
     header, rows = ["planner", "parameters", "over Diffuser"], []
     for size in sizes:
@@ -73,7 +82,7 @@ def describe(content: dict) -> str:
                 cells.append(f"{middle:g} ({low:g} to {high:g})")
         rows.append(cells)
     return (
-        f"## {device}\n\n"
+        f"## {device_name(content)}{threads}\n\n"
         f"For `{result['task']}`: {result['num_layers']} layers of width {result['width']}, "
         f"{result['num_inference_steps']} steps a plan. Median and quartiles of {result['rounds']} rounds.\n\n"
         f"{markdown_table(header, rows)}\n`{run['command']}`, code of {run['git_commit']}.\n"
@@ -82,7 +91,7 @@ def describe(content: dict) -> str:
 
 def write_page() -> None:
     """Write the page from the results files."""
-    parts = [describe(json.loads(path.read_text())) for path in sorted(FILES.glob("*.json"))]
+    parts = [describe(content) for content in read_results()]
     about = "Networks of the paper's size, with random weights. A ratio compares two times of the same round."
     PAGE.write_text("\n".join(["# Size and latency of the planners\n", f"{about}\n", *parts]))
 

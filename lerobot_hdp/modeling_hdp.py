@@ -283,7 +283,7 @@ class HDPPolicy(PreTrainedPolicy):
         inputs = [key for key in (*self.config.input_features, OBS_SYMBOLIC_PLAN) if key in batch]
         repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in inputs}
         if isinstance(prompt, PlanPrompt):
-            prompt.check(self._motion_shape(batch), self._symbols_shape(batch), self.vocabulary)
+            prompt.check(self._motion_shape(batch), self.config.symbolic_horizon, self.vocabulary)
             prompt = prompt.repeat(k)
         elif prompt is not None:
             prompt = [text for text in _one_text_each(prompt, self._batch_size(batch)) for _ in range(k)]
@@ -351,7 +351,7 @@ class HDPPolicy(PreTrainedPolicy):
             length = self.config.symbolic_horizon
             prompt = PlanPrompt(token_ids=place_prompts(texts, self.vocabulary, length, self._device, ask, generator))
         prompt = prompt.to(self._device)
-        prompt.check(self._motion_shape(batch), self._symbols_shape(batch), self.vocabulary)
+        prompt.check(self._motion_shape(batch), self.config.symbolic_horizon, self.vocabulary)
         return prompt
 
     def _ask_for_symbols(self, batch: dict[str, Tensor], generator: Generator | None, given: Tensor) -> Tensor:
@@ -444,10 +444,6 @@ class HDPPolicy(PreTrainedPolicy):
     def _motion_shape(self, batch: dict[str, Tensor]) -> tuple[int, int, int]:
         """(B, H_c, D)."""
         return self._batch_size(batch), self.config.horizon, self.config.action_feature.shape[0]
-
-    def _symbols_shape(self, batch: dict[str, Tensor]) -> tuple[int, int] | None:
-        """(B, H_d); None where no symbols are modelled."""
-        return None if self.symbol_process is None else (self._batch_size(batch), self.config.symbolic_horizon)
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
         """The README.md that goes to the Hub with the weights: LeRobot's, and what this planner is."""

@@ -67,22 +67,22 @@ class PlanPrompt:
         return bool((self.actions_given.any(dim=1) & ~self.actions_given.all(dim=1)).any())
 
     def check(
-        self, motion_shape: tuple[int, int, int], symbols_shape: tuple[int, int] | None, vocabulary: Vocabulary | None
+        self, motion_shape: tuple[int, int, int], symbolic_horizon: int | None, vocabulary: Vocabulary | None
     ) -> None:
         """Refuse what does not fit a planner.
 
         Args:
             motion_shape: (B, H_c, D).
-            symbols_shape: (B, H_d).
-            vocabulary: of the planner; like `symbols_shape`, None where it models no symbols.
+            symbolic_horizon: H_d.
+            vocabulary: of the planner; None where it models no symbols.
 
         Raises:
             ValueError: a tensor of another shape or type, unknown token ids, or NaN.
         """
         if self.token_ids is not None:
-            if symbols_shape is None or vocabulary is None:
+            if vocabulary is None:
                 raise ValueError("this planner models no symbols: it takes no symbolic prompt")
-            _check_tensor("token_ids", self.token_ids, symbols_shape, torch.int64)
+            _check_tensor("token_ids", self.token_ids, (motion_shape[0], symbolic_horizon), torch.int64)
             size = len(vocabulary)
             if ((self.token_ids < FREE_SYMBOL) | (self.token_ids >= size)).any():
                 raise ValueError(f"token_ids must be in [0, {size - 1}], or {FREE} or {FREE_SYMBOL}, see PlanPrompt")
@@ -104,7 +104,7 @@ class PlanPrompt:
         return PlanPrompt(**{name: None if value is None else value.to(device) for name, value in given.items()})
 
 
-def _check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+def _check_tensor(name: str, tensor: Tensor, shape: tuple[int | None, ...], dtype: torch.dtype) -> None:
     if tuple(tensor.shape) != shape or tensor.dtype != dtype:
         raise ValueError(
             f"{name} must have the shape {shape} and the type {dtype}, got {tuple(tensor.shape)} and {tensor.dtype}"

@@ -1,24 +1,19 @@
 """What runs on CUDA does what it does on a CPU. Skipped where there is no such device."""
 
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
 from lerobot.policies import get_policy_class
 
 from benchmarks.evaluation import evaluate
+from benchmarks.paper.presets import METHODS
+from benchmarks.training_step import GRAPHS
 from lerobot_hdp import PlanPrompt
 
 from .conftest import REPOSITORY, TASK_FLAGS, TINY_PLANNER, observation, run_command, train_in_process
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
-PLANNERS = ("hdp", "diffuser", "joint_diffuser", "separate_diffuser", "hd", "chd")
-GRAPHS = {"compile_model": True, "compile_mode": "reduce-overhead"}
-
-
-def on_cuda(inputs):
-    return {key: value.cuda() if isinstance(value, torch.Tensor) else value for key, value in inputs.items()}
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="tests CUDA, which is not on this machine")
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
@@ -28,14 +23,14 @@ def test_the_network_predicts_the_same(make_planner, batch, dtype):
     motion, tokens = inputs["action"], policy.symbol_process.prior((4, policy.config.symbolic_horizon), "cpu")
     level = torch.full((4,), 0.5)
     expected = policy._denoiser(inputs)(motion, tokens, level, level)
-    policy, inputs = policy.cuda(), on_cuda(inputs)
-    found = policy._denoiser(inputs)(motion.cuda(), tokens.cuda(), level.cuda(), level.cuda())
+    inputs = {key: value.cuda() for key, value in observation(inputs).items()}
+    found = policy.cuda()._denoiser(inputs)(motion.cuda(), tokens.cuda(), level.cuda(), level.cuda())
     tolerance = 1e-4 if dtype == "float32" else 3e-2
     for one, other in zip(found, expected, strict=True):
         assert (one.cpu() - other).norm() < tolerance * other.norm()
 
 
-@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("planner", METHODS)
 def test_a_planner_learns_and_plans(make_planner, batch, training_batch, planner):
     policy, preprocessor, _ = make_planner(planner, device="cuda")
     history = train_in_process(policy, preprocessor(training_batch(policy)), steps=60)
@@ -107,5 +102,5 @@ def test_a_training_goes_on_on_another_device(dataset_root, tmp_path, first, the
 
 
 def test_a_checkpoint_from_a_cpu_does_its_task():
-    result = evaluate(Path(REPOSITORY) / "checkpoints/xarm_sorting", starts=20, first_seed=5_000, device="cuda")
+    result = evaluate(REPOSITORY / "checkpoints/xarm_sorting", starts=20, first_seed=5_000, device="cuda")
     assert result["success_rate"] >= 0.85

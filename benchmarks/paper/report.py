@@ -8,6 +8,7 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
+from .. import planner_latency
 from ..cells import read_result
 from ..conditioning_tables import percent
 from ..evaluation import MISTAKES
@@ -213,13 +214,12 @@ def adherence() -> str:
 
 def latency() -> str:
     """Time of a plan over Diffuser's, on each device."""
-    contents = [json.loads(path.read_text()) for path in sorted((RESULTS / "planner_latency").glob("*.json"))]
-    if not contents:
+    if not (contents := planner_latency.read_results()):
         return f"{MISSING}: `python -m benchmarks.planner_latency`\n"
     theirs = published.LATENCY_OVER_DIFFUSER
     columns = {"paper": {method: f"+{theirs[method]} %" for method in METHODS if method in theirs}}
     for content in contents:
-        device = content["run"]["gpu"] if content["result"]["device"] == "cuda" else content["run"]["cpu"]
+        device = planner_latency.device_name(content)
         for size, measured in content["result"]["batch_size"].items():
             ratios = {method: measured[method]["ratio"][1] for method in METHODS}
             columns[f"{device}, batch {size}"] = {name: f"{100 * (ratio - 1):+.0f} %" for name, ratio in ratios.items()}
