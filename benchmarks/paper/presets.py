@@ -93,7 +93,7 @@ PRESETS: dict[str, Preset] = {
         policy={"preset": "default", "dtype": "bfloat16"},
         tasks={
             "xarm_sorting": Training(200, 2_400, 50),
-            "xarm_arrange_blocks": Training(4_000, 3_000, 50, _MANY_DEMONSTRATIONS),
+            "xarm_arrange_blocks": Training(4_000, 5_000, 50, _MANY_DEMONSTRATIONS),
             "xarm_tool_use": Training(400, 2_000, 50),
             **_TASKS_2D,
         },
