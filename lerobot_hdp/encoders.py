@@ -47,8 +47,8 @@ class StateEncoder(nn.Module):
         return len(self.token_sizes)
 
     def forward(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """Observations (B, n) or (B, 1, n) each -> (B, num_tokens, width)."""
-        state = torch.cat([batch[key].flatten(1) for key in self.keys], dim=-1)
+        """Observations (B, n) or (B, 1, n), or (B,) where n is 1, each -> (B, num_tokens, width)."""
+        state = torch.cat([batch[key].reshape(len(batch[key]), -1) for key in self.keys], dim=-1)
         parts = state.split(self.token_sizes, dim=-1)
         return torch.stack([project(part) for project, part in zip(self.projections, parts, strict=True)], dim=1)
 

@@ -1,6 +1,7 @@
 """What a planner's card on the Hub says beside what LeRobot writes on every card."""
 
 from huggingface_hub import ModelCard
+from lerobot.envs import EnvConfig
 
 from .configuration_hdp import HDPConfig
 
@@ -15,12 +16,13 @@ SUMMARIES = {
 }
 
 
-def describe_planner(card: ModelCard, config: HDPConfig) -> ModelCard:
+def describe_planner(card: ModelCard, config: HDPConfig, env: EnvConfig | None = None) -> ModelCard:
     """Say below the card's title what the planner is, what it needs and how it is asked for a plan.
 
     Args:
         card: as LeRobot makes it.
         config: of the planner, complete with what the dataset says.
+        env: that of its training configuration. In one of ours, `hdp-plan` draws and executes plans.
     """
     where = config.repo_id or "<repository>"
     lines = [
@@ -34,8 +36,12 @@ def describe_planner(card: ModelCard, config: HDPConfig) -> ModelCard:
         words = " ".join(f"`{symbol}`" for symbol in symbols)
         lines += [
             f"Symbols, at most {config.symbolic_horizon} in a plan: {words}. A part of the plan may be given in these "
-            "words, `_` standing for any one:",
-            f'```bash\nhdp-plan --policy.path={where} --prompt="_ {symbols[0]}"\n```',
+            f'words, `_` standing for any one: `--policy.prompt="{symbols[0]} ..."`.',
+        ]
+    if env is not None and env.type == "hdp":
+        lines += [
+            "A plan, in words and pictures, and its execution:",
+            f"```bash\nhdp-plan --policy.path={where} --seed=1\n```",
         ]
     title, rest = card.text.split("# ", 1)[1].split("\n", 1)
     card.text = "\n\n".join([f"# {title}", *lines]) + "\n" + rest

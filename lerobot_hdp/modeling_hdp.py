@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from huggingface_hub import ModelCard
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from safetensors import SafetensorError
@@ -119,7 +120,7 @@ class HDPPolicy(PreTrainedPolicy):
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
         self.register_buffer("forward_calls", torch.tensor(0))
         self._seed_and_calls: tuple[int, int] | None = None
-        self.register_load_state_dict_pre_hook(self._start_average)
+        self.register_load_state_dict_pre_hook(self._start_or_end_average)
         self.reset()
 
     def _make_planner(self) -> Planner:
@@ -132,6 +133,7 @@ class HDPPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Forget the plan in execution. To be called on `env.reset()`."""
         self._queue: deque[Tensor] = deque()
+        self._has_planned = False
 
     def update(self) -> None:
         """Move the averaged weights. LeRobot calls this after each optimiser step."""
@@ -415,9 +417,21 @@ class HDPPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
-        """The next action of the plan, after making one if there is none: (B, D)."""
+        """The next action of the plan, after making one if there is none: (B, D).
+
+        Warns:
+            UserWarning: a planner of whole episodes has come to the end of its plan, and plans again, from where it is.
+        """
         self.eval()
         if not self._queue:
+            if self._has_planned and self.config.plan_from == "episode_start":
+                warnings.warn(
+                    f"the plan of {self.config.horizon} actions has ended, and another is made from here, where a "
+                    "planner of whole episodes has learned nothing. End the episode, or train with "
+                    "--policy.plan_from=any_frame; before each episode, call reset().",
+                    stacklevel=2,
+                )
+            self._has_planned = True
             self._queue.extend(self.predict_action_chunk(batch).unbind(dim=1))
         return self._queue.popleft()
 
@@ -431,7 +445,7 @@ class HDPPolicy(PreTrainedPolicy):
         return self.noise_seed.device
 
     def _autocast(self) -> torch.autocast:
-        """For planning; in training, Accelerate does the same (`dtype`)."""
+        """For the denoiser in planning; in training, Accelerate has all of the planner compute so (`dtype`)."""
         return torch.autocast(self._device.type, torch.bfloat16, enabled=self.config.dtype == "bfloat16")
 
     @property
@@ -445,18 +459,38 @@ class HDPPolicy(PreTrainedPolicy):
         """(B, H_c, D)."""
         return self._batch_size(batch), self.config.horizon, self.config.action_feature.shape[0]
 
-    def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
+    def generate_model_card(self, *args: Any, cfg: TrainPipelineConfig | None = None, **kwargs: Any) -> ModelCard:
         """The README.md that goes to the Hub with the weights: LeRobot's, and what this planner is."""
-        return describe_planner(super().generate_model_card(*args, **kwargs), self.config)
+        card = super().generate_model_card(*args, cfg=cfg, **kwargs)
+        return describe_planner(card, self.config, cfg.env if cfg else None)
 
-    def _start_average(self, _: nn.Module, state: dict[str, Tensor], prefix: str, *__: Any) -> None:
-        """Let a planner that was saved without averaged weights be trained on with some."""
-        if self.ema is None or any(name.startswith(f"{prefix}ema.") for name in state):
-            return
-        network = f"{prefix}planner."
-        weights = {name.removeprefix(network): value for name, value in state.items() if name.startswith(network)}
-        state |= {f"{prefix}ema.module.{name}": value for name, value in weights.items()}
-        state[f"{prefix}ema.n_averaged"] = torch.zeros_like(self.ema.n_averaged)
+    def _validate_peft_config(self, peft_config: Any) -> None:
+        """Refuse adapters.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(
+            "a planner of a few million weights is trained on as a whole: leave out --peft. Adapters would be trained "
+            "beside the average that plans, which a checkpoint of adapters does not hold."
+        )
+
+    def _start_or_end_average(self, _: nn.Module, state: dict[str, Tensor], prefix: str, *__: Any) -> None:
+        """Let a planner that was saved without averaged weights be trained on with some, or the other way round.
+
+        Without an average, the weights that plan are those that are trained: they start from the averaged ones.
+        """
+        network, average = f"{prefix}planner.", f"{prefix}ema."
+        averaged = {name: value for name, value in state.items() if name.startswith(average)}
+        if self.ema is None:
+            for name, value in averaged.items():
+                del state[name]
+                if name.startswith(f"{average}module."):
+                    state[network + name.removeprefix(f"{average}module.")] = value
+        elif not averaged:
+            weights = {name.removeprefix(network): value for name, value in state.items() if name.startswith(network)}
+            state |= {f"{average}module.{name}": value for name, value in weights.items()}
+            state[f"{average}n_averaged"] = torch.zeros_like(self.ema.n_averaged)
 
     @classmethod
     def _load_as_safetensor(cls, model: "HDPPolicy", model_file: str, map_location: str, strict: bool) -> "HDPPolicy":

@@ -1,5 +1,6 @@
 """Dataset or environment batch <-> what the planner sees."""
 
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,8 +47,8 @@ class SymbolicPlanProcessorStep(ObservationProcessorStep):
         if plan is None or self.symbolic_horizon is None:
             return observation
         plan = torch.as_tensor(plan).long()
-        if plan.ndim == 1:
-            plan = plan.unsqueeze(0)
+        if plan.ndim == 1:  # one sample; or a batch of plans of one token, which LeRobot stores as numbers
+            plan = plan.unsqueeze(1 if self.symbolic_horizon == 1 else 0)
         if plan.shape[1] > self.symbolic_horizon:
             raise ValueError(f"a plan of {plan.shape[1]} tokens is longer than {self.symbolic_horizon=}")
         unknown = (plan < FREE_SYMBOL) | (plan >= self.vocabulary_size)
@@ -96,7 +97,8 @@ def widen_narrow_ranges(config: HDPConfig, stats: dict[str, dict[str, Any]]) -> 
 
     Where plans begin, some components never vary, as the orientation of blocks that stand upright. Over all frames they
     have a tiny range, that of contacts; scaled by it to [-1, 1], a turn by a tenth of a degree would be far beyond all
-    that the planner has seen.
+    that the planner has seen. It takes the components of an observation to be in comparable units: metres and radians,
+    but not metres and degrees.
 
     Args:
         config: says what is observed, and which of it is normalised by its range.
@@ -107,6 +109,13 @@ def widen_narrow_ranges(config: HDPConfig, stats: dict[str, dict[str, Any]]) -> 
             continue
         low, high = (np.asarray(stats[key][bound]) for bound in ("min", "max"))
         middle, half = (low + high) / 2, (high - low) / 2
-        narrow = half < NARROWEST_RANGE * half.max()
-        stats[key]["min"] = np.where(narrow, middle - NARROWEST_RANGE * half.max(), low)
-        stats[key]["max"] = np.where(narrow, middle + NARROWEST_RANGE * half.max(), high)
+        narrowest = NARROWEST_RANGE * half.max()
+        narrow = half < narrowest
+        stats[key]["min"] = np.where(narrow, middle - narrowest, low)
+        stats[key]["max"] = np.where(narrow, middle + narrowest, high)
+        if (half < 0.99 * narrowest).any():  # not widened before
+            logging.info(
+                "%s: components %s vary by less than a tenth of the widest one's range, %.3g, and are normalised by a "
+                "tenth of it. If they are in other units than it, put them into an observation of their own.",
+                key, np.flatnonzero(narrow).tolist(), 2 * half.max(),
+            )  # fmt: skip

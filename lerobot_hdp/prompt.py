@@ -177,7 +177,9 @@ def _parse(prompt: str, vocabulary: Vocabulary) -> list[Part]:
             raise ValueError(f"{said} comes after {vocabulary.symbols[PAD_ID]}, where the plan has ended")
         else:
             parts[-1].ids.append(token)
-    if parts and parts[-1].start is None and parts[-1].ids and (not begins or parts[-1].ends):
+    if parts and parts[-1].start is None and not parts[-1].ids:
+        parts.pop()  # `... PAD`: that a plan ends somewhere says nothing
+    elif parts and parts[-1].start is None and (not begins or parts[-1].ends):
         parts[-1].start = -len(parts[-1].ids)
     return parts
 

@@ -165,7 +165,8 @@ def sample_plan(
 def _steps_ahead(prompt: PlanPrompt, symbol_lead: float, num_steps: int) -> int:
     """How many steps the symbols are ahead of the motion.
 
-    None where they have something to follow, a part of the motion that pure noise would hide, or nothing to decide.
+    None where they have something to follow, a part of the motion that pure noise would hide, or, in the whole batch,
+    nothing to decide.
     """
     if prompt.actions is not None or (prompt.tokens_mask is not None and bool(prompt.tokens_mask.all())):
         return 0

@@ -32,6 +32,8 @@ class Vocabulary:
     def __init__(self, symbols: Sequence[str]):
         if len(symbols) < 2 or len({symbol.upper() for symbol in symbols}) != len(symbols):
             raise ValueError(f"a vocabulary is PAD and at least one more symbol, each once; got {list(symbols)}")
+        if symbols[PAD_ID].upper() != "PAD":
+            raise ValueError(f"the first symbol of a vocabulary is PAD, which ends plans; got {list(symbols)}")
         for symbol in symbols:
             if not re.fullmatch(r"[^\s:…]+", symbol) or symbol == "_" or "..." in symbol:
                 raise ValueError(

@@ -10,7 +10,8 @@ import torch
 import torch.nn.functional as F
 from draccus.utils import ParsingError
 from huggingface_hub import ModelCard
-from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs import DatasetConfig, FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_eval, lerobot_train
@@ -75,17 +76,21 @@ class TestContract:
     def test_its_card_on_the_hub_says_what_it_is(self, planner, make_planner, dataset, inputs, monkeypatch):
         monkeypatch.setattr(ModelCard, "validate", lambda card: None)  # asks the Hub
         policy, *_ = make_planner(planner, repo_id="me/sorter")
-        card = policy.generate_model_card("local/sorting", planner, None, ["xarm"], dataset_meta=dataset.meta)
+        about = "local/sorting", planner, None, ["xarm"]
+        card = policy.generate_model_card(*about, dataset_meta=dataset.meta)
         assert {"lerobot", "robotics", planner, "xarm"} == set(card.data.tags)
         assert card.content.count("# Model Card for") == 1
         assert "From one observation it plans 19 actions" in card.content
         assert "`lerobot_policy_hdp`" in card.content
         assert "| `observation.environment_state` |" in card.content
-        prompt = 'hdp-plan --policy.path=me/sorter --prompt="_ A"'
-        assert (prompt in card.content) == (planner in WITH_SYMBOLS)
+        assert ('`--policy.prompt="A ..."`' in card.content) == (planner in WITH_SYMBOLS)
         if planner in WITH_SYMBOLS:
-            given = policy.read_prompt(inputs, "_ A").token_ids
-            assert policy.vocabulary.symbols[given[0, 1]] == "A"
+            given = policy.read_prompt(inputs, "A ...").token_ids
+            assert policy.vocabulary.symbols[given[0, 0]] == "A"
+        assert "hdp-plan" not in card.content  # an environment of ours is not known of
+        trained = TrainPipelineConfig(DatasetConfig("local/sorting"), env=HDPEnv(task="BlockSorting2D-v0", n_blocks=2))
+        card = policy.generate_model_card(*about, cfg=trained, dataset_meta=dataset.meta)
+        assert "hdp-plan --policy.path=me/sorter --seed=1" in card.content
 
     def test_plans_are_of_the_tasks_shape(self, make_planner, batch, planner):
         policy, preprocessor, postprocessor = make_planner(planner)

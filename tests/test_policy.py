@@ -1,5 +1,6 @@
 """The planner as a LeRobot policy, in one process. What all planners share is tested in test_baselines.py."""
 
+import warnings
 from itertools import pairwise
 
 import pytest
@@ -12,6 +13,7 @@ from torch.utils.data import default_collate
 from lerobot_hdp import FREE, HDPConfig, PlanPrompt
 from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
 from lerobot_hdp.denoiser import DecoderLayer
+from lerobot_hdp.encoders import StateEncoder
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.processor_hdp import SymbolicPlanProcessorStep
 from lerobot_hdp.prompt import encode_prompt
@@ -57,6 +59,16 @@ def test_a_plan_depends_on_every_observation(make_planner, batch, object_tokens,
             assert not torch.equal(encoder(changed), encoder(inputs))
 
 
+def test_what_lerobot_stores_as_numbers_is_read_as_columns():
+    """Features of shape (1,) are: of a batch it makes (B,)."""
+    encoder = StateEncoder(["observation.state", "observation.gripper"], [3, 1], width=8, weight_std=0.5)
+    batch = {"observation.state": torch.rand(5, 3), "observation.gripper": torch.rand(5, 1)}
+    numbers = {**batch, "observation.gripper": batch["observation.gripper"][:, 0]}
+    assert torch.equal(encoder(numbers), encoder(batch))
+    step = SymbolicPlanProcessorStep(symbolic_horizon=1, vocabulary_size=3)
+    assert step.observation({OBS_SYMBOLIC_PLAN: torch.tensor([2, 1, 2])})[OBS_SYMBOLIC_PLAN].shape == (3, 1)
+
+
 @pytest.mark.parametrize(("hidden_dim", "is_linear"), [(0, True), (16, False)])
 def test_a_state_encoder_with_hidden_units_is_not_linear(make_planner, batch, hidden_dim, is_linear):
     policy, preprocessor, _ = make_planner(state_encoder_hidden_dim=hidden_dim)
@@ -66,8 +78,9 @@ def test_a_state_encoder_with_hidden_units_is_not_linear(make_planner, batch, hi
     assert torch.allclose(encode(between), (encode(near) + encode(far)) / 2, atol=1e-5) == is_linear
 
 
-def test_what_hardly_varies_in_the_dataset_is_not_blown_up(dataset, make_planner, batch, tmp_path, monkeypatch):
+def test_what_hardly_varies_in_the_dataset_is_not_blown_up(dataset, make_planner, batch, tmp_path, monkeypatch, caplog):
     """Neither in a new training, nor in one that goes on from a checkpoint, as `lerobot-train` makes its normaliser."""
+    caplog.set_level("INFO")
     key = "observation.environment_state"
     raw = dataset.meta.stats[key]
 
@@ -78,6 +91,7 @@ def test_what_hardly_varies_in_the_dataset_is_not_blown_up(dataset, make_planner
 
     with_a_narrow_component()
     _, new, postprocessor = make_planner()
+    assert caplog.text.count(f"{key}: components [0] vary by less than a tenth of the widest one's range") == 1
     for processor in (new, postprocessor):
         processor.save_pretrained(tmp_path)
     with_a_narrow_component()
@@ -257,6 +271,19 @@ def test_a_smaller_n_action_steps_replans(make_planner, batch):
     assert len(calls) == 3 * policy.config.num_train_timesteps
 
 
+def test_going_on_after_the_end_of_a_whole_plan_is_warned_of(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    inputs = observation(preprocessor(batch))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(2):
+            policy.reset()
+            for _ in range(HORIZON):
+                policy.select_action(inputs)
+    with pytest.warns(UserWarning, match="the plan of 19 actions has ended"):
+        policy.select_action(inputs)
+
+
 def test_any_frame_trains_on_what_remains(make_planner, dataset):
     policy, preprocessor, _ = make_planner(plan_from="any_frame")
     assert policy.config.drop_n_last_frames == 0
@@ -316,6 +343,24 @@ def test_a_planner_saved_without_averaged_weights_can_be_trained_on_with_some(ma
     assert loaded.ema.n_averaged == 0
     for name, weight in policy.planner.named_parameters():
         torch.testing.assert_close(loaded.ema.module.get_parameter(name), weight.detach())
+
+
+def test_a_planner_with_averaged_weights_can_be_trained_on_without(make_planner, batch, tmp_path):
+    policy, preprocessor, _ = make_planner()
+    with torch.no_grad():
+        for weight in policy.planner.parameters():
+            weight += 0.1
+    policy.save_pretrained(tmp_path)
+    policy.config.ema_max_decay = 0.0
+    loaded = HDPPolicy.from_pretrained(tmp_path, config=policy.config)
+    inputs = observation(preprocessor(batch))
+    plans = [each.plan(inputs, generator=torch.Generator().manual_seed(0)) for each in (policy.eval(), loaded.eval())]
+    assert torch.equal(plans[0].actions, plans[1].actions)
+
+
+def test_adapters_are_refused(make_planner):
+    with pytest.raises(ValueError, match="leave out --peft"):
+        make_planner()[0]._validate_peft_config(None)
 
 
 def test_a_held_out_loss_depends_on_nothing_but_weights_and_data(make_planner, batch):

@@ -39,7 +39,9 @@ def placements(prompt: str, vocabulary: Vocabulary = VOCABULARY, length: int = L
             ["DRAG RED BLUE . . .", "DRAG RED _ BLUE . .", "DRAG RED _ _ BLUE .", "DRAG RED _ _ _ BLUE"],
         ),
         ("DRAG RED ... BLUE GREEN STACK ...", ["DRAG RED BLUE GREEN STACK _", "DRAG RED _ BLUE GREEN STACK"]),
-        ("... 5:BLUE ... PAD", ["_ _ _ _ BLUE .", "_ _ _ _ BLUE _"]),
+        ("... PAD", ["_ _ _ _ _ _"]),
+        ("DRAG RED ... PAD", ["DRAG RED _ _ _ _"]),
+        ("... 5:BLUE ... PAD", ["_ _ _ _ BLUE _"]),
         (
             "... STACK RED PAD",
             ["STACK RED . . . .", "_ STACK RED . . .", "_ _ STACK RED . .", "_ _ _ STACK RED .", "_ _ _ _ STACK RED"],

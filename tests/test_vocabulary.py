@@ -41,3 +41,8 @@ def test_a_free_position_is_no_part_of_a_whole_plan():
 def test_symbols_are_named_once():
     with pytest.raises(ValueError, match="each once"):
         Vocabulary(["PAD", "A", "a"])
+
+
+def test_the_first_symbol_is_pad():
+    with pytest.raises(ValueError, match="the first symbol of a vocabulary is PAD"):
+        Vocabulary(["A", "B"])
