@@ -16,9 +16,9 @@ from itertools import product
 from statistics import mean
 from typing import Any
 
-from .cells import Cell, read_result, run_cells
+from .cells import Cell, points_that_count, read_result, run_cells
 from .pages import DOCS, markdown_table
-from .paper.presets import PRESETS, make_cell
+from .paper.presets import PRESETS, complete, make_cell
 
 PAGE = DOCS / "ablations.md"
 TASKS = {
@@ -131,7 +131,7 @@ def variant_of(name: str, task: str, seed: int) -> Cell:
         cell,
         group="ablations",
         name=f"{task}_{name.replace(', ', '_').replace('/', '_')}_seed{seed}",
-        policy={**cell.policy, **CHANGES[name]},
+        policy=complete({**cell.policy, **CHANGES[name]}),
         facts={"variant": name},
     )
 
@@ -150,7 +150,7 @@ def write_page() -> None:
     scores: dict[tuple[str, str], list[float]] = defaultdict(list)
     for (variant, task, _), cell in cells.items():
         if content := read_result(cell):
-            rates = [point["success_rate"] for point in content["result"]["curve"][-cell.average_last :]]
+            rates = [point["success_rate"] for point in points_that_count(content["result"])]
             scores[variant, task].append(100 * mean(rates))
     rows = [[f"`{variant}`", *(_each(scores[variant, task]) for task in TASKS)] for variant in VARIANTS]
     spread = max(max(seeds) - min(seeds) for seeds in scores.values() if seeds)

@@ -108,6 +108,18 @@ class Cell:
         return DATASETS / "_".join([*parts, f"{self.demonstrations}_episodes"])
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """All that its figures depend on, beside the code."""
+        names = ("env", "demonstrations", "policy", "steps", "batch_size", "seed")
+        names += ("evaluations", "starts", "average_last")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def settings_file(self) -> Path:
+        """The settings with which it was begun."""
+        return self.folder / "settings.json"
+
+    @property
     def evaluate_every(self) -> int:
         """Optimiser steps between two evaluations. There may be fewer before the last one."""
         return math.ceil(self.steps / self.evaluations)
@@ -151,12 +163,23 @@ class Cell:
         Raises:
             ValueError: it was trained or evaluated otherwise than this cell says.
         """
-        for name in ("demonstrations", "steps", "batch_size", "seed", "starts", "average_last", "policy"):
-            if result[name] != getattr(self, name):
+        for name, value in self.settings.items():
+            if result[name] != value:
                 raise ValueError(
-                    f"{self.result_file} was made with {name}={result[name]}, not {getattr(self, name)}: delete it, or "
-                    "put the old setting back"
+                    f"{self.result_file} was made with {name}={result[name]}, not {value}: delete it, or put the old "
+                    "setting back"
                 )
+
+    def check_begun(self) -> None:
+        """Refuse to go on with what was begun under another description of this cell.
+
+        Raises:
+            ValueError: its folder holds a checkpoint of other settings.
+        """
+        if self.last_checkpoint is None:
+            return
+        if not self.settings_file.exists() or json.loads(self.settings_file.read_text()) != self.settings:
+            raise ValueError(f"{self.folder} was begun with other settings: delete it to begin again")
 
 
 def read_result(cell: Cell) -> dict[str, Any] | None:
@@ -172,6 +195,16 @@ def read_result(cell: Cell) -> dict[str, Any] | None:
     return content
 
 
+def all_runs(content: dict[str, Any]) -> list[dict[str, Any]]:
+    """All runs (`describe_run`) that a results file comes from, the last one last."""
+    return [*content.get("earlier_runs", []), content["run"]]
+
+
+def points_that_count(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """Of a result's learning curve, the evaluations at its end whose mean is the cell's figure."""
+    return result["curve"][-result["average_last"] :]
+
+
 def complete_checkpoints(folder: Path) -> list[Path]:
     """The complete checkpoints in a cell's folder, by their step."""
     return sorted(path.parent for path in folder.glob(f"train/checkpoints/[0-9]*/{TRAIN_S}"))
@@ -183,7 +216,7 @@ class Progress:
 
     Attributes:
         curve: the evaluations so far.
-        runs: of `describe_run`, for each time that the training was started.
+        runs: of `describe_run`, for each time that it was begun or gone on with.
     """
 
     curve: list[dict[str, Any]] = field(default_factory=list)
@@ -262,10 +295,13 @@ def run_cell(cell: Cell, threads: int = 1, deadline: Deadline | None = None) -> 
     deadline = deadline or Deadline(None)
     cell.folder.mkdir(parents=True, exist_ok=True)
     with _lock(cell.folder / "lock"):
+        cell.check_begun()
         if cell.last_step < cell.steps:
             if deadline.seconds_left < SHORTEST_TRAINING_S:
                 return f"{cell.name}: {cell.state()}, no time left"
             train(cell, threads, deadline)
+        else:
+            note_run(cell)
         evaluate_checkpoints(cell, threads, deadline)
         progress = Progress.load(cell)
         if [point["step"] for point in progress.curve][-1:] != [cell.steps]:
@@ -298,29 +334,29 @@ def train(cell: Cell, threads: int, deadline: Deadline) -> None:
 
 
 def start_training(cell: Cell, threads: int, deadline: Deadline) -> BaseProcess:
-    """Start or resume `hdp-train` in a process of its own.
-
-    Raises:
-        ValueError: the cell was begun with other settings.
-    """
-    config_file, config = cell.folder / "train_config.json", cell.train_config()
+    """Start or resume `hdp-train` in a process of its own."""
     train_s = 0.0
     if last := cell.last_checkpoint:
-        if json.loads(config_file.read_text()) != config:
-            raise ValueError(f"{cell.folder} was begun with other settings: delete it to begin again")
         train_s = json.loads((last.parent / TRAIN_S).read_text())
         arguments = ["--resume=true", f"--config_path={last / 'train_config.json'}"]
     else:
         shutil.rmtree(cell.folder / "train", ignore_errors=True)
         (cell.folder / "progress.json").unlink(missing_ok=True)
-        _write_json(config_file, config)
+        _write_json(cell.settings_file, cell.settings)
+        config_file = cell.folder / "train_config.json"
+        _write_json(config_file, cell.train_config())
         arguments = [f"--config_path={config_file}"]
     if deadline.seconds_left < math.inf:
         arguments.append(f"--max_train_minutes={deadline.seconds_left / 60:.3f}")
+    note_run(cell)
+    return _start(cell.folder / "train.log", threads, _hdp_train, arguments, train_s)
+
+
+def note_run(cell: Cell) -> None:
+    """Add this run to those that a cell's figures come from."""
     progress = Progress.load(cell)
     progress.runs.append(describe_run())
     progress.save(cell)
-    return _start(cell.folder / "train.log", threads, _hdp_train, arguments, train_s)
 
 
 def _hdp_train(arguments: list[str], train_s: float) -> None:
@@ -384,15 +420,8 @@ def result_of(cell: Cell, progress: Progress) -> dict[str, Any]:
     train_s = json.loads((cell.last_checkpoint.parent / TRAIN_S).read_text())
     return {
         **cell.facts,
-        "task": cell.env["task"].removesuffix("-v0"),
         "planner": cell.policy["type"],
-        "seed": cell.seed,
-        "demonstrations": cell.demonstrations,
-        "steps": cell.steps,
-        "batch_size": cell.batch_size,
-        "starts": cell.starts,
-        "average_last": cell.average_last,
-        "policy": cell.policy,
+        **cell.settings,
         "parameters": num_parameters(policy),
         "network_calls_per_plan": policy.config.num_inference_steps,
         "train_s": round(train_s, 1),

@@ -7,7 +7,7 @@ import argparse
 import json
 import time
 
-from .evaluation import evaluate, wilson_interval
+from .evaluation import evaluate
 from .machine import REPOSITORY, RESULTS, describe_run
 
 FIRST_SEED = 3_000_000
@@ -22,12 +22,10 @@ def main() -> None:
     for config in sorted((REPOSITORY / "checkpoints").glob("*/config.json")):
         begin = time.monotonic()
         result = evaluate(config.parent, options.starts, FIRST_SEED)
-        successes = round(result["success_rate"] * options.starts)
         results.append(
             {
                 "checkpoint": config.parent.name,
                 "starts": options.starts,
-                "interval_95": wilson_interval(successes, options.starts),
                 **result,
                 "seconds": round(time.monotonic() - begin, 1),
             }

@@ -184,7 +184,9 @@ def rate(hits: Sequence[bool]) -> dict[str, Any]:
 
 
 def evaluate(path: Path, starts: int, first_seed: int, **options: Any) -> dict[str, Any]:
-    """Success and mean score of a checkpoint; of the failures how many had a valid symbolic plan, and how these failed.
+    """How well a checkpoint does: success with its 95 % interval, and mean score.
+
+    Of the failures of a planner with symbols also how many had a valid symbolic plan, and how these failed.
 
     Args:
         path: a `pretrained_model` folder.
@@ -195,8 +197,10 @@ def evaluate(path: Path, starts: int, first_seed: int, **options: Any) -> dict[s
     subject = load(path, starts, first_seed=first_seed, **options)
     plans = make_plans(subject)
     outcomes = execute(subject, plans.motions, subject.seeds)
+    success = rate([outcome["is_success"] for outcome in outcomes])
     result = {
-        "success_rate": round(np.mean([outcome["is_success"] for outcome in outcomes]), 4),
+        "success_rate": success["rate"],
+        "interval_95": success["interval_95"],
         "mean_score": round(np.mean([outcome["score"] for outcome in outcomes]), 4),
     }
     if subject.policy.symbol_process is not None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from statistics import mean
 from typing import Any, NamedTuple
 
-from .cells import Cell, read_result
+from .cells import Cell, all_runs, points_that_count, read_result
 from .machine import RESULTS
 from .pages import DOCS, LABELS, markdown_table, plot_curves
 from .paper.presets import METHODS
@@ -33,7 +33,7 @@ class Panel(NamedTuple):
 
 def at_the_end(result: dict[str, Any], figure: str) -> float:
     """A figure's mean over the last evaluations of one cell."""
-    return mean(point[figure] for point in result["curve"][-result["average_last"] :])
+    return mean(point[figure] for point in points_that_count(result))
 
 
 def rows(planners: dict[str, list[dict[str, Any]]]) -> Iterable[Sequence[str]]:
@@ -100,7 +100,7 @@ def write_page(cells: Sequence[Cell]) -> None:
             panel = Panel(cell.env["n_blocks"], cell.facts["preset"])
             panels[panel][cell.policy["type"]].append(content["result"])
             settings[panel] = cell
-            commits.add(content["run"]["git_commit"])
+            commits |= {run["git_commit"] for run in all_runs(content)}
     if not panels:
         raise SystemExit("no cell of the comparison is finished yet")
     panels = dict(sorted(panels.items()))

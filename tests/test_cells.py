@@ -2,15 +2,19 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
 from dataclasses import asdict, replace
 from importlib.metadata import distributions
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
 from benchmarks import cells
 from benchmarks.cells import Cell, Deadline, complete_checkpoints, num_parameters, run_cell, run_cells, start_training
@@ -24,12 +28,11 @@ from benchmarks.planner_latency import make_planner
 from .conftest import N_EPISODES, REPOSITORY
 
 
-@pytest.fixture
-def cell(dataset_root, tmp_path, monkeypatch) -> Cell:
-    """A tiny cell on the dataset of the test suite, with empty folders for checkpoints and results."""
-    monkeypatch.chdir(tmp_path)  # where datasets and checkpoints go
+def make_tiny_cell(folder: Path, dataset_root: Path, monkeypatch: pytest.MonkeyPatch) -> Cell:
+    """A tiny cell on the dataset of the test suite, with checkpoints and results in a folder."""
+    monkeypatch.chdir(folder)  # where datasets and checkpoints go
     for module in (cells, packing):
-        monkeypatch.setattr(module, "RESULTS", tmp_path / "results")
+        monkeypatch.setattr(module, "RESULTS", folder / "results")
     tiny = {"num_layers": 1, "num_heads": 2, "width": 32, "num_inference_steps": 3, "device": "cpu"}
     mini = make_cell("mini", "block_sorting_2d_2_blocks", "hdp", seed=0)
     tiny_cell = replace(
@@ -48,14 +51,32 @@ def cell(dataset_root, tmp_path, monkeypatch) -> Cell:
 
 
 @pytest.fixture
-def finished(cell) -> Cell:
+def cell(dataset_root, tmp_path, monkeypatch) -> Cell:
+    return make_tiny_cell(tmp_path, dataset_root, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def where_it_was_run(dataset_root, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        run_cell(make_tiny_cell(folder, dataset_root, monkeypatch))
+    return folder
+
+
+@pytest.fixture
+def finished(cell, where_it_was_run, tmp_path) -> Cell:
     """The same, run."""
-    run_cell(cell)
+    for folder in ("results", cells.WORK):
+        shutil.copytree(where_it_was_run / folder, tmp_path / folder, symlinks=True)
     return cell
 
 
+def content(cell: Cell) -> dict[str, Any]:
+    return json.loads(cell.result_file.read_text())
+
+
 def curve(cell: Cell) -> list[dict[str, Any]]:
-    return json.loads(cell.result_file.read_text())["result"]["curve"]
+    return content(cell)["result"]["curve"]
 
 
 def test_a_cell_holds_its_learning_curve_and_keeps_its_last_checkpoint(finished):
@@ -78,6 +99,8 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(finished):
     assert killed.state().startswith("trained ")
     run_cell(killed)
     assert curve(killed) == curve(finished)
+    weights = [load_file(each.last_checkpoint / "model.safetensors") for each in (killed, finished)]
+    assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
 
 
 @pytest.mark.parametrize("moment", ["_evaluate", "result_of"])
@@ -97,6 +120,7 @@ def test_a_failure_after_the_training_costs_no_training(finished, monkeypatch, m
     monkeypatch.setattr(cells, "start_training", None)
     run_cell(failing)
     assert curve(failing) == curve(finished)
+    assert len(content(failing)["earlier_runs"]) == 1
 
 
 def test_killing_the_benchmark_ends_the_training(cell, tmp_path):
@@ -134,8 +158,9 @@ def test_a_finished_cell_is_not_run_again_and_must_be_what_it_says(finished):
     with pytest.raises(ValueError, match="was made with steps=300, not 400"):
         cells.read_result(replace(finished, steps=400))
     finished.result_file.unlink()
-    with pytest.raises(ValueError, match="was begun with other settings"):
-        run_cell(replace(finished, steps=400))
+    for changes in ({"steps": 400}, {"starts": 3}, {"policy": {**finished.policy, "dropout": 0.1}}):
+        with pytest.raises(ValueError, match="was begun with other settings"):
+            run_cell(replace(finished, **changes))
 
 
 def test_a_training_that_fails_names_its_log(cell, capsys):
@@ -179,10 +204,10 @@ def test_an_exported_planner_makes_the_same_plans(finished, tmp_path):
 
 def write_result(cell: Cell, scores: list[float], failures: int) -> None:
     """A results file with known figures."""
-    outcome = {"valid_plans": 98, "failures": failures, "failures_with_valid_plan": 1}
+    outcome = {"valid_plans": 98, "failures": failures, "failures_with_valid_plan": min(failures, 1)}
     points = [{"step": i, "success_rate": score, "mean_score": score, **outcome} for i, score in enumerate(scores)]
-    settings = {key: value for key, value in asdict(cell).items() if key not in ("env", "facts", "name", "group")}
-    result = {**settings, "planner": cell.policy["type"], "train_s": 90.0, "samples_per_second": 7.0, "curve": points}
+    facts = {"planner": cell.policy["type"], "train_s": 90.0, "samples_per_second": 7.0, "curve": points}
+    result = {**cell.settings, **facts}
     run = {"gpu": None, "cpu": "Abacus", "cores": 2, "git_commit": "abc"}
     cell.result_file.parent.mkdir(parents=True, exist_ok=True)
     cell.result_file.write_text(json.dumps({"run": run, "result": result}))
@@ -192,16 +217,20 @@ def test_the_report_has_what_was_run_and_says_what_is_missing(tmp_path, monkeypa
     monkeypatch.setattr(cells, "RESULTS", tmp_path)
     write_result(make_cell("mini", "xarm_sorting", "hdp", 0), [0.0] * 7 + [0.8, 0.9, 1.0], failures=3)
     write_result(make_cell("mini", "xarm_sorting", "hdp", 1), [0.0] * 7 + [0.9, 0.9, 0.9], failures=0)
+    write_result(make_cell("mini", "xarm_sorting", "hdp", 2), [0.0] * 7 + [1.0, 1.0, 1.0], failures=0)
     write_result(make_cell("mini", "xarm_sorting", "diffuser", 0), [0.0] * 9 + [0.6], failures=0)
+    for seed, score in enumerate((0.4, 0.5)):
+        write_result(make_cell("mini", "xarm_sorting", "joint_diffuser", seed), [score] * 10, failures=0)
     page, *plots = report.write_report(tmp_path / "page.md")
     assert all(path.exists() for path in plots)
     text = page.read_text()
-    # Means of the seeds 0.9 and 0.9, standard deviation of 0.8, 0.9, 1.0, 0.9, 0.9, 0.9: 6.3 %.
-    assert "| HDP | 86 % (5 %) | 90 % (6 %), 2 seeds: 90 to 90 | 74 % (10 %) | missing | 78 % (4 %) | missing |" in text
+    # Means of the seeds 90, 90, 100: 93.3 +- 4.303 * 5.77 / sqrt(3); standard deviation of all evaluations 7.1.
+    assert "| HDP | 86 % (5 %) | 93 % (7 %), 3 seeds: 79 to 100 | 74 % (10 %) | missing |" in text
     assert "| Diffuser | 46 % (6 %) | 20 % (35 %), one seed |" in text
-    assert "| xarm_sorting, mini | 600 | 9 | 3 | 6 |" in text
-    assert "| xarm_sorting, mini | 1.5 min, 7/s | 1.5 min, 7/s | missing |" in text
-    assert "3 of 108 with `--preset mini`" in text
+    assert "| Joint Diffuser | 42 % (5 %) | 45 % (5 %), seeds: 40, 50 |" in text
+    assert "| xarm_sorting, mini | 900 | 9 | 6 | 3 |" in text
+    assert "| xarm_sorting, mini | 1.5 min, 7/s | 1.5 min, 7/s | 1.5 min, 7/s | missing |" in text
+    assert "6 of 108 with `--preset mini`" in text
 
 
 def test_the_committed_page_is_what_the_committed_results_make(tmp_path):

@@ -1,11 +1,15 @@
 """What the README shows of Python does what it says, and the pages' links lead somewhere."""
 
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
+from statistics import mean
 
 import pytest
+
+from benchmarks.cells import points_that_count
 
 from .conftest import REPOSITORY
 
@@ -20,6 +24,15 @@ def test_the_examples_in_python_run():
     assert "PICK 1.00  B 1.00" in result.stdout
     assert "(145, 4)" in result.stdout
     assert "True" in result.stdout.splitlines()
+
+
+def test_figures_that_link_to_a_results_file_are_what_it_says():
+    text = (REPOSITORY / "README.md").read_text()
+    figures = re.findall(r"\[(\d+) %\]\((benchmarks/results/paper/\S+\.json)\)", text)
+    assert len(figures) > 3
+    for figure, path in figures:
+        points = points_that_count(json.loads((REPOSITORY / path).read_text())["result"])
+        assert int(figure) == round(100 * mean(point["success_rate"] for point in points)), path
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))

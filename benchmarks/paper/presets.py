@@ -7,6 +7,8 @@ from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_hdp.configuration_hdp import PRESETS as POLICY_PRESETS
+
 from ..cells import Cell
 
 METHODS = ("hdp", "diffuser", "joint_diffuser", "separate_diffuser", "hd", "chd")
@@ -159,6 +161,23 @@ PRESETS: dict[str, Preset] = {
 TASKS = tuple(ENVS)
 
 
+def complete(policy: dict[str, Any]) -> dict[str, Any]:
+    """A policy's options, and the values that its preset fills, without those that mean nothing to it.
+
+    A cell says them all, so that its result is not taken for one of the preset as it is later.
+    """
+    config = PreTrainedConfig.get_choice_class(policy["type"])
+    unused = {"type"}
+    if config.symbol_process != "masked":
+        unused |= {"lead_share", "symbol_lead"}
+    if config.symbol_process is None:
+        unused |= {"symbolic_horizon", "symbol_loss_weight"}
+    options = {name: value for name, value in policy.items() if name not in unused}
+    filled = config(**options, device="cpu")
+    values = {name: getattr(filled, name) for name in POLICY_PRESETS["default"] if name not in unused}
+    return {"type": policy["type"], **options, **values}
+
+
 def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
     """The cell of a preset, a task, a method and a seed.
 
@@ -170,18 +189,12 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
     policy = {"type": method, **preset.policy, **training.policy}
     if method == "hdp":
         policy |= preset.hdp_policy
-    process = PreTrainedConfig.get_choice_class(method).symbol_process
-    if process is None:
-        policy.pop("symbolic_horizon", None)
-    if process != "masked":
-        policy.pop("lead_share", None)
-        policy.pop("symbol_lead", None)
     return Cell(
         group=f"paper/{preset_name}",
         name=f"{task}_{method}_seed{seed}",
         env=ENVS[task],
         demonstrations=training.demonstrations,
-        policy=policy,
+        policy=complete(policy),
         steps=training.steps,
         batch_size=training.batch_size,
         seed=seed,
