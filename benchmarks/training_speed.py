@@ -1,6 +1,7 @@
 """`hdp-train` beside `lerobot-train`: the data path alone, the step's overhead, and both commands end to end.
 
     python -m benchmarks.training_speed --root=outputs/datasets/xarm_sorting --horizon=145
+    python -m benchmarks.training_speed --report    # docs/training_speed.md, from results of this and training_step.py
 
 On one dataset and with one policy. What is compared is measured in turns, in a random order in each round, so that
 whatever else the machine does falls on both; a ratio compares the two of a round, and is given as [first quartile,
@@ -119,7 +120,10 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=50, help="of the data path and the step")
     parser.add_argument("--command_rounds", type=int, default=5, help="of the commands, at least 2")
     parser.add_argument("--steps", type=int, default=20, help="of the commands, twice, the first for warming up")
+    parser.add_argument("--report", action="store_true", help="only write docs/training_speed.md")
     options = parser.parse_args()
+    if options.report:
+        return write_page()
 
     sizes = {name: getattr(options, name) for name in ("horizon", "num_layers", "width")}
     config = PreTrainedConfig.get_choice_class("hdp")(**sizes, dtype="bfloat16", device="cpu", push_to_hub=False)
@@ -137,7 +141,9 @@ def main() -> None:
         f"--num_workers={options.num_workers}",
         "--dataloader_multiprocessing_context=fork",
     ]
-    result = {name: value for name, value in vars(options).items() if name != "root"} | {"dataset": options.root.name}
+    left_out = ("root", "report")
+    result = {name: value for name, value in vars(options).items() if name not in left_out}
+    result["dataset"] = options.root.name
     torch.set_num_threads(1)
     run = describe_run()
     result["data_path"] = data_path(dataset, options.batch_size, options.horizon, options.rounds)

@@ -1,6 +1,7 @@
 """A training step of the paper's network with each way of making it fast switched on or off.
 
     python -m benchmarks.training_step --root=outputs/datasets/XArmSorting_200_episodes --device=cuda
+    python -m benchmarks.training_speed --report    # its table is on docs/training_speed.md
 
 A step is all that `hdp-train` does between two: reading, preprocessing, forward and backward pass, optimiser, moving
 average. The settings take turns, in a random order in each round.

@@ -170,6 +170,7 @@ def test_a_training_that_fails_names_its_log(cell, capsys):
 
 
 def test_cells_run_from_a_packed_folder_and_come_back(cell, tmp_path):
+    cell = replace(cell, steps=20, evaluations=1, average_last=1)
     folder = tmp_path / "packed"
     pack([cell], folder)
     assert {found.metadata["Name"] for found in distributions(path=[str(folder)])} == {"lerobot_policy_hdp"}
