@@ -10,6 +10,7 @@ export TOKENIZERS_PARALLELISM = false
 .PHONY: help setup quickstart test lint format clean
 
 help:
+	@echo "make setup        .venv with all that is needed"
 	@echo "make quickstart   record, train, evaluate and plan on the smallest task (10 minutes on 2 cores)"
 	@echo "make test         run the test suite"
 	@echo "make lint         check style and types        make format   format the code"

@@ -152,7 +152,11 @@ def write_page() -> None:
         if content := read_result(cell):
             rates = [point["success_rate"] for point in points_that_count(content["result"])]
             scores[variant, task].append(100 * mean(rates))
-    rows = [[f"`{variant}`", *(_each(scores[variant, task]) for task in TASKS)] for variant in VARIANTS]
+    rows = [
+        [f"`{variant}`", *(_each(scores[variant, task]) for task in TASKS)]
+        for variant in VARIANTS
+        if any(scores[variant, task] for task in TASKS)
+    ]
     spread = max(max(seeds) - min(seeds) for seeds in scores.values() if seeds)
     bases = [cells[VARIANTS[0], task, SEEDS[0]] for task in TASKS]
     PAGE.write_text(

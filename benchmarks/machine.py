@@ -2,6 +2,7 @@
 
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from importlib import import_module
@@ -17,7 +18,7 @@ PACKAGES = ("lerobot", "torch", "gymnasium", "mujoco", "numpy")
 def describe_run() -> dict[str, object]:
     """The command, the code, the machine and the versions of the packages that matter, for a results file."""
     return {
-        "command": "python -m " + " ".join([_module_name(), *sys.argv[1:]]),
+        "command": "python -m " + shlex.join([_module_name(), *sys.argv[1:]]),
         "git_commit": git_commit(),
         "cpu": _cpu_name(),
         "cores": os.cpu_count(),

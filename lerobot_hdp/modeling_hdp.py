@@ -557,6 +557,6 @@ def _check_episodes_fit(config: HDPConfig, lengths: Iterable[int]) -> None:
     if config.plan_from == "episode_start" and lengths != {config.horizon}:
         raise ValueError(
             f"the dataset's episodes have {min(lengths)} to {max(lengths)} frames, the planner's horizon is "
-            f"{config.horizon}. Set --policy.horizon to the episodes' length; if they differ among each other, "
-            "train with --policy.plan_from=any_frame. Episodes that --dataset.episodes leaves out count, too."
+            f"{config.horizon}. Set --policy.horizon to the episodes' length; if they differ among each other, let the "
+            "shorter ones hold their last waypoint. Episodes that --dataset.episodes leaves out count, too."
         )

@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from draccus.utils import ParsingError
+from httpx import HTTPError
 from lerobot import envs, policies  # noqa: F401 (registers LeRobot's own)
 from lerobot.configs import PolicyFeature, PreTrainedConfig, parser
 from lerobot.configs.default import DatasetConfig
@@ -211,7 +212,7 @@ def explain(config: PlanConfig) -> str:
         raise ValueError("the checkpoint names no dataset: choose one with --dataset.repo_id=... --dataset.root=...")
     try:
         dataset = LeRobotDataset(source.repo_id, root=source.root, video_backend="pyav")
-    except OSError as error:
+    except (OSError, HTTPError) as error:
         raise ValueError(f"the dataset {source.repo_id} is not in {source.root}, nor to be had: {error}") from error
     for key, feature in {**policy.config.input_features, **policy.config.output_features}.items():
         shape = tuple(dataset.meta.features.get(key, {}).get("shape", ()))
