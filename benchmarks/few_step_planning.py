@@ -38,7 +38,8 @@ Success in % of fresh starts (95 % interval), over the network calls for a plan.
   motion that is still pure noise, the other half denoise the motion. Without a lead, the motion may commit itself to a
   plan of its own before the symbols have made up theirs. With a lead, it has half of the calls: 5 are too few then.
 
-Each section names the command that made it, as it was at that commit. Set `--policy.sampler`, `--policy.symbol_lead` and `--policy.num_inference_steps`.
+Each section names the command that made it, as it was at that commit. Set `--policy.sampler`, `--policy.symbol_lead`
+and `--policy.num_inference_steps`.
 
 """
 

@@ -60,7 +60,8 @@ def write_report(page: Path = DOCS / "results.md") -> list[Path]:
         "# Results, beside the paper's\n",
         "Written by `python -m benchmarks.paper --report` from the files in `benchmarks/results/`; `python -m "
         "benchmarks.paper --list` says what can be run next. A preset, here, is a series of trainings "
-        "([`presets.py`](../benchmarks/paper/presets.py)); `--policy.preset` is a planner's settings. Figures of the paper are as printed there. Finished "
+        "([`presets.py`](../benchmarks/paper/presets.py)); `--policy.preset` is a planner's settings. Figures of the "
+        "paper are as printed there. Finished "
         f"cells (a method, a task and one of the seeds {', '.join(map(str, SEEDS))}): {counts}.\n",
         "## The simulation table\n",
         "The mean score and, in parentheses, its standard deviation over seeds and over the checkpoints at the end of "
