@@ -1,7 +1,7 @@
 """`hdp/BlockSorting2D-v0`: sort blocks in the plane with one auxiliary slot.
 
-The smallest task on which a long motion needs a plan: two blocks can only be exchanged by way of the auxiliary
-slot. Kinematic and exact, so that a failure is the planner's and never the physics'.
+The smallest task on which a long motion needs a plan. The plan's language knows slots only, so that a plan exchanges
+two blocks by way of the auxiliary one. Kinematic and exact: a failure is the planner's and never the physics'.
 """
 
 from collections.abc import Sequence
@@ -156,6 +156,7 @@ class BlockSorting2DEnv(gym.Env):
             order = np.asarray(options["order"])
             if sorted(order) != list(range(self.n_blocks)):
                 raise ValueError(f"order must be a permutation of 0..{self.n_blocks - 1}, got {order.tolist()}")
+            order = order.astype(int)
         offsets = self.np_random.uniform(-START_OFFSET, START_OFFSET, size=(self.n_blocks, 2))
         self.blocks = np.empty((self.n_blocks, 2))
         self.blocks[order] = self.slots[: self.n_blocks] + offsets

@@ -126,6 +126,15 @@ def test_the_score_is_the_fraction_of_blocks_in_their_slots():
     assert finish(env)[0] == 0
 
 
+@pytest.mark.parametrize("order", [[1, 0], np.array([1.0, 0.0])])
+def test_starts_in_the_order_that_it_is_given(order):
+    env = make(2).unwrapped
+    env.reset(seed=0, options={"order": order})
+    assert env.blocks[0, 0] > env.blocks[1, 0]
+    with pytest.raises(ValueError, match="permutation"):
+        env.reset(options={"order": [0, 0.5]})
+
+
 @pytest.mark.parametrize(("offset", "counts"), [(0.99, True), (1.01, False)])
 def test_a_block_counts_as_far_as_its_slots_edge(offset, counts):
     env = make(2)
