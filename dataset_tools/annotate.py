@@ -11,6 +11,7 @@ Example:
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,14 +39,22 @@ def add_symbolic_plans(
         root: its folder.
 
     Raises:
-        ValueError: there is not one plan for each episode.
+        ValueError: there is not one plan for each episode, a step has the word PAD, or the steps of an episode are not
+            done one after the other, between its first frame and its end.
     """
     if len(plans) != dataset.meta.total_episodes:
         raise ValueError(f"there are {len(plans)} plans for {dataset.meta.total_episodes} episodes")
+    lengths = dataset.meta.episodes["length"]
+    for episode, (plan, length) in enumerate(zip(plans, lengths, strict=True)):
+        stops = [step.stop for step in plan]
+        if any(stop <= earlier for earlier, stop in pairwise([0, *stops])) or max(stops, default=0) > length:
+            raise ValueError(f"the stops of episode {episode} must strictly increase within 1..{length}, got {stops}")
+        if any(PAD in step.symbols for step in plan):
+            raise ValueError(f"a step of episode {episode} has the word {PAD}, which only fills plans up")
     vocabulary = [PAD, *sorted({symbol for plan in plans for step in plan for symbol in step.symbols})]
     symbolic_horizon = max(sum(len(step.symbols) for step in plan) for plan in plans)
     token_ids = []
-    for plan, length in zip(plans, dataset.meta.episodes["length"], strict=True):
+    for plan, length in zip(plans, lengths, strict=True):
         demonstration = Demonstration(np.empty((length, *dataset.meta.shapes[ACTION])), tuple(plan))
         token_ids += [demonstration.remaining_token_ids(frame, vocabulary, symbolic_horizon) for frame in range(length)]
     column = {"dtype": "int64", "shape": (symbolic_horizon,), "names": None, "info": {"vocabulary": vocabulary}}

@@ -40,3 +40,21 @@ def test_a_planner_trains_on_plans_that_were_written_afterwards(without_plans, t
 def test_every_episode_needs_a_plan(without_plans, tmp_path):
     with pytest.raises(ValueError, match=r"there are 1 plans for \d+ episodes"):
         add_symbolic_plans(without_plans, [[PICK]], "test/with", tmp_path / "with")
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        ([PLACE, PICK], r"stops of episode 1 must strictly increase within 1..19, got \[15, 8\]"),
+        ([PICK, PICK], "stops of episode 1"),
+        ([PICK._replace(stop=0)], "stops of episode 1"),
+        ([PICK, PLACE._replace(stop=HORIZON + 1)], "stops of episode 1"),
+        ([PICK, PlanStep(("PLACE", "PAD"), HORIZON)], "a step of episode 1 has the word PAD"),
+    ],
+)
+def test_a_plan_that_no_episode_can_have_is_refused(without_plans, tmp_path, plan, message):
+    plans = [[PICK]] * without_plans.meta.total_episodes
+    plans[1] = plan
+    with pytest.raises(ValueError, match=message):
+        add_symbolic_plans(without_plans, plans, "test/with", tmp_path / "with")
+    assert not (tmp_path / "with").exists()
