@@ -132,8 +132,11 @@ def main() -> None:
     parser.add_argument("--num_threads", type=int, help="as many as there are cores when not given")
     options = parser.parse_args()
     try:
-        with np.load(options.plans, allow_pickle=False) as file:
-            seeds, plans = file["seeds"], file["plans"]
+        file = np.load(options.plans, allow_pickle=False)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise ValueError(f"{options.plans} is one array, not an .npz file with `seeds` and `plans`")
+        with file:
+            seeds, plans = file["seeds"].tolist(), file["plans"]
         outcomes = execute_plans(f"hdp/{options.task}", seeds, plans, options.num_threads)
     except (OSError, zipfile.BadZipFile, KeyError, ValueError, gym.error.Error) as error:
         sys.exit(f"open_loop: {error}")

@@ -10,7 +10,7 @@ import pytest
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from dataset_tools.experts import EXPERTS
-from gym_hdp_tasks.open_loop import execute_plans
+from gym_hdp_tasks.open_loop import execute_plans, main
 
 GYM_ID = "hdp/XArmArrangeBlocks-v0"
 SEEDS = [11, 12, 13, 14]
@@ -85,3 +85,10 @@ def test_the_command_prints_scores_as_json_and_refuses_a_broken_file(plans, tmp_
     answer = run(tmp_path / "broken.npz")
     assert answer.returncode != 0
     assert len(answer.stderr.strip().splitlines()) == 1
+
+
+def test_a_file_of_one_array_is_refused(tmp_path, monkeypatch):
+    np.save(tmp_path / "plans.npy", np.zeros((1, 25, 4)))
+    monkeypatch.setattr(sys, "argv", ["open_loop", "XArmArrangeBlocks-v0", str(tmp_path / "plans.npy")])
+    with pytest.raises(SystemExit, match=r"^open_loop: .*plans.npy is one array, not an .npz file[^\n]*$"):
+        main()
