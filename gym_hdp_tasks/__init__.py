@@ -1,5 +1,6 @@
 """Gymnasium tasks that need a long motion and a plan behind it. Importing this package registers their ids."""
 
+import ctypes.util
 import os
 import sys
 
@@ -7,8 +8,10 @@ import gymnasium as gym
 
 from .task import PAD, PlanningTask
 
-if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-    os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo, which reads this when it is imported, would look for a display
+# MuJoCo, which reads this when it is imported, would look for a display; with `egl` and no EGL, its import fails.
+_has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+if sys.platform == "linux" and not _has_display and ctypes.util.find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
 
 __all__ = ["PAD", "PlanningTask"]
 

@@ -61,6 +61,7 @@ def robot_spec(robot: str = "primitive") -> mujoco.MjSpec:
     Raises:
         ValueError: `robot` is not one of `ROBOTS`.
         ImportError: `menagerie` without the package `mujoco-menagerie`.
+        OSError: `menagerie`, and its model cannot be downloaded, or is not in the folder `MENAGERIE_ROOT`.
     """
     if robot not in ROBOTS:
         raise ValueError(f"robot must be one of {ROBOTS}, got {robot!r}")
@@ -78,7 +79,13 @@ def _menagerie_spec() -> mujoco.MjSpec:
         import mujoco_menagerie
     except ImportError as error:
         raise ImportError("robot='menagerie' needs mujoco-menagerie, this package's extra `menagerie`") from error
-    spec = mujoco_menagerie.get("ufactory_xarm7").spec("xarm7")
+    try:
+        spec = mujoco_menagerie.get("ufactory_xarm7").spec("xarm7")
+    except mujoco_menagerie.MenagerieError as error:
+        raise OSError(
+            "cannot load the model of robot='menagerie', which is downloaded on first use or read from the folder "
+            f"MENAGERIE_ROOT: {error}"
+        ) from error
     spec.body("link_base").pos = (0, 0, 0)
     for name, armature in zip(ARM_JOINTS, _ARMATURE, strict=True):
         joint, actuator = spec.joint(name), spec.actuator(name.replace("joint", "act"))

@@ -109,9 +109,9 @@ class XArmEnv(gym.Env):
         self.add_objects(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        self._tool = self.data.site(TCP_SITE)
+        self._tool = self.model.site(TCP_SITE).id
         self._gripper = GRIPPERS[robot]
-        self._gripper_tendon = self.data.tendon(self._gripper.tendon)
+        self._gripper_tendon = self.model.tendon(self._gripper.tendon).id
         self._arm_qpos = np.array([self.model.joint(name).qposadr[0] for name in ARM_JOINTS])
         self._object_qpos = np.array([self.model.joint(name).qposadr[0] + np.arange(7) for name in self.object_names])
         self._motion = WaypointMotion(robot_model, self._gripper, 1 / planning_task.fps, self.model.opt.timestep)
@@ -220,12 +220,12 @@ class XArmEnv(gym.Env):
 
     def tool_position(self) -> np.ndarray:
         """Measured x, y, z of the tool, in metres: (3,)."""
-        return self._tool.xpos.copy()
+        return self.data.site_xpos[self._tool].copy()
 
     def gripper_opening(self) -> float:
         """Measured opening, in [0, 1]."""
         closed, opened = self._gripper.length
-        length = self._gripper_tendon.length.item()
+        length = self.data.ten_length[self._gripper_tendon]
         return float(np.clip((length - closed) / (opened - closed), 0.0, 1.0))
 
     def object_poses(self) -> np.ndarray:
