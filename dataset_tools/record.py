@@ -108,6 +108,8 @@ class RecordConfig:
     def __post_init__(self):
         if self.dataset.num_episodes < 1 or self.num_workers < 1:
             raise ParsingError("--dataset.num_episodes and --num_workers must be at least 1")
+        if self.seed < 0:
+            raise ParsingError(f"--seed must be at least 0, got {self.seed}")
         if self.dataset.push_to_hub and get_token() is None:
             raise ParsingError("--dataset.push_to_hub=true needs a login: run `hf auth login` first")
 
@@ -452,7 +454,10 @@ def try_environment(config: RecordConfig) -> None:
     try:
         env.reset(seed=0)
     except mujoco.FatalError as error:
-        raise ValueError(f"cannot render images; without a display, set MUJOCO_GL=egl ({error})") from error
+        raise ValueError(
+            "cannot render images; without a display, MuJoCo needs EGL (Debian, Ubuntu: libegl1) and MUJOCO_GL=egl "
+            f"({error})"
+        ) from error
     finally:
         env.close()
 
@@ -505,7 +510,10 @@ def _merge(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) ->
     if config.dataset.language:
         write_language_columns(merged, config.env.planning_task.vocabulary)
     info = load_info(merged)
-    info.features[SYMBOLIC_PLAN]["info"]["failed_attempts"] = {str(k): v for k, v in sorted(failed.items())}
+    info.features[SYMBOLIC_PLAN]["info"] |= {
+        "num_episodes": info.total_episodes,  # a dataset that was edited has another number
+        "failed_attempts": {str(k): v for k, v in sorted(failed.items())},
+    }
     write_info(info, merged)
     dataset = LeRobotDataset(repo_id, root=merged, video_backend="pyav")
     card = create_lerobot_dataset_card(
@@ -536,6 +544,18 @@ def describe(task: PlanningTask, dataset: LeRobotDataset) -> str:
     )
 
 
+def accept_env_type() -> None:
+    """Take `--env.type=hdp`, which LeRobot's commands require, off the command line: there is no other type to record.
+
+    Raises:
+        ParsingError: it says another type.
+    """
+    env_type = parser.get_type_arg("env")
+    if env_type not in (None, "hdp"):
+        raise ParsingError(f"--env.type={env_type} has no experts, only --env.type=hdp has")
+    sys.argv[1:] = parser.filter_arg("env.type", sys.argv[1:])
+
+
 @parser.wrap()
 def _main(config: RecordConfig) -> None:
     record(config)
@@ -546,6 +566,7 @@ def main() -> None:
     logging.getLogger("lerobot").setLevel(logging.WARNING)
     exit_when_terminated()
     try:
+        accept_env_type()
         _main()
     except KeyboardInterrupt:
         sys.exit("hdp-record: interrupted; go on with --resume=true")

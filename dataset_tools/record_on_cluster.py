@@ -25,6 +25,7 @@ from lerobot.configs import parser
 from .record import (
     RecordConfig,
     Shard,
+    accept_env_type,
     finish_earlier_recording,
     merge_shards,
     plan_shards,
@@ -50,7 +51,7 @@ class SlurmConfig:
 
 @dataclass
 class ClusterRecordConfig(RecordConfig):
-    """Options of `hdp-record`, and the cluster's. `num_workers` tasks run at a time; `resume` is always on."""
+    """Options of `hdp-record`, and the cluster's. `num_workers` tasks run at a time; `resume` is on by default."""
 
     slurm: SlurmConfig = field(default_factory=SlurmConfig)
     resume: bool = True
@@ -116,10 +117,14 @@ def _main(config: ClusterRecordConfig) -> None:
 def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
+        accept_env_type()
         _main()
     except (ParsingError, ValueError, OSError, ImportError) as error:
         sys.exit(f"record_on_cluster: {error}")
 
 
 if __name__ == "__main__":
+    # The jobs unpickle what this module defines, and their `__main__` is another one.
+    from dataset_tools.record_on_cluster import main
+
     main()

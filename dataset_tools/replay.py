@@ -36,11 +36,22 @@ class Recording(NamedTuple):
 
 
 def load_recording(dataset: LeRobotDataset) -> Recording:
-    """Actions and scores of a dataset that `hdp-record` wrote, with the seeds that its metadata tell."""
-    info = dataset.meta.features[SYMBOLIC_PLAN]["info"]
-    attempts = [info["failed_attempts"].get(str(episode), 0) for episode in range(dataset.num_episodes)]
-    seeds = [episode_seed(info["seed"], episode, attempt) for episode, attempt in enumerate(attempts)]
+    """Actions and scores of a dataset that `hdp-record` wrote, or of some of its episodes, with their seeds.
+
+    The seeds follow from the metadata and from the episodes' indices.
+
+    Raises:
+        ValueError: episodes were added or removed since, so that the indices are others.
+    """
+    info, total = dataset.meta.features[SYMBOLIC_PLAN]["info"], dataset.meta.total_episodes
+    recorded = info.get("num_episodes", total)  # which older recordings do not tell
+    if total != recorded:
+        raise ValueError(
+            f"{dataset.root} has {total} episodes and was recorded with {recorded}: which seeds they have is not known"
+        )
     rows = dataset.hf_dataset.with_format("numpy")
+    episodes = np.unique(rows["episode_index"][:])
+    seeds = [episode_seed(info["seed"], i, info["failed_attempts"].get(str(i), 0)) for i in episodes.tolist()]
     plans = np.stack(rows[ACTION]).reshape(len(seeds), -1, dataset.meta.shapes[ACTION][0])
     scores = np.stack(rows[REWARD]).reshape(len(seeds), -1)[:, -1]
     return Recording(info["gym_id"], info["parameters"], seeds, plans, scores)

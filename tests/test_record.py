@@ -13,12 +13,22 @@ import numpy as np
 import psutil
 import pytest
 from draccus.utils import ParsingError
+from lerobot.datasets.dataset_tools import delete_episodes
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from dataset_tools import record as recorder
+from dataset_tools import record_on_cluster as cluster
 from dataset_tools.experts import EXPERTS
-from dataset_tools.record import RecordConfig, RecordDatasetConfig, plan_shards, record, shard_starts
+from dataset_tools.record import (
+    RecordConfig,
+    RecordDatasetConfig,
+    episode_seed,
+    plan_shards,
+    record,
+    record_shard,
+    shard_starts,
+)
 from dataset_tools.replay import load_recording, replay
 from gym_hdp_tasks.env_config import HDPEnv
 
@@ -61,7 +71,7 @@ def test_a_dataset_explains_itself(dataset_root):
     assert info["vocabulary"] == ["PAD", "A", "B", "PICK", "PLACE", "S1", "S2", "AUX"]
     assert info["gym_id"] == "hdp/BlockSorting2D-v0"
     assert info["parameters"] == {"n_blocks": 2, "waypoints_per_pose": 1}
-    assert (info["seed"], info["failed_attempts"]) == (0, {})
+    assert (info["seed"], info["num_episodes"], info["failed_attempts"]) == (0, N_EPISODES, {})
 
 
 def test_episodes_are_whole_and_successful(recorded):
@@ -92,6 +102,25 @@ def test_recorded_actions_replay_to_the_recorded_score(dataset):
     assert replay(recording) == recording.scores.tolist() == [1.0] * N_EPISODES
 
 
+def test_some_episodes_of_a_recording_replay_from_their_own_seeds(dataset_root):
+    some = load_recording(LeRobotDataset("test/sorting", root=dataset_root, episodes=[7, 3], video_backend="pyav"))
+    assert some.seeds == [episode_seed(0, 3), episode_seed(0, 7)]
+    assert replay(some) == some.scores.tolist() == [1.0, 1.0]
+
+
+def test_a_recording_that_was_edited_does_not_replay_from_wrong_seeds(dataset, tmp_path):
+    shorter = delete_episodes(dataset, [0], output_dir=tmp_path / "shorter", repo_id="test/shorter")
+    with pytest.raises(ValueError, match=f"has {N_EPISODES - 1} episodes and was recorded with {N_EPISODES}"):
+        load_recording(shorter)
+
+
+def test_a_recording_that_does_not_tell_its_number_of_episodes_replays(dataset, monkeypatch):
+    info = dict(dataset.meta.features["observation.symbolic_plan"]["info"])
+    del info["num_episodes"]  # as before it was written
+    monkeypatch.setitem(dataset.meta.features["observation.symbolic_plan"], "info", info)
+    assert len(load_recording(dataset).seeds) == N_EPISODES
+
+
 def test_the_result_does_not_depend_on_the_number_of_processes(dataset_root, tmp_path):
     root = tmp_path / "two_workers"
     flags = ("--dataset.repo_id=test/sorting", f"--dataset.root={root}", f"--dataset.num_episodes={N_EPISODES}")
@@ -107,6 +136,38 @@ def test_a_cluster_engine_records_the_same_dataset(dataset_root, tmp_path):
     assert not root.with_name("cluster.partial").exists()
 
 
+def test_a_slurm_job_records_a_shard(tmp_path, monkeypatch):
+    """Submitted to a Slurm that only gives out job numbers; the test does what the first job would."""
+    for name, answer in (("sbatch", "Submitted batch job 42"), ("scontrol", "node1")):
+        (tmp_path / name).write_text(f"#!/bin/sh\necho {answer}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    root = tmp_path / "slurm"
+    flags = ("--dataset.repo_id=test/slurm", f"--dataset.root={root}", "--dataset.num_episodes=2")
+    run_command("python", "-m", "dataset_tools.record_on_cluster", *TASK_FLAGS, *flags, "--slurm.partition=cpu")
+    shard = root.with_name("slurm.partial") / "episodes_000000"
+    assert not shard.exists()
+    for name, value in (("SLURM_ARRAY_TASK_ID", "0"), ("SLURM_NODELIST", "node1"), ("SLURM_JOB_ID", "42")):
+        monkeypatch.setenv(name, value)
+    run_command("launch_pickled_pipeline", root.with_name("slurm.logs") / "record" / "executor.pik")
+    assert load_info(shard).total_episodes == 1
+
+
+@pytest.mark.parametrize(("module", "function"), [(recorder, "record"), (cluster, "record_on_cluster")])
+def test_env_type_may_be_given_as_to_lerobot_s_commands(monkeypatch, module, function):
+    configs: list[RecordConfig] = []
+    monkeypatch.setattr(module, function, configs.append)
+    monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    for env_type in ([], ["--env.type=hdp"], ["--env.type", "hdp"]):
+        monkeypatch.setattr(sys, "argv", ["record", "--dataset.repo_id=t/t", *env_type, *TASK_FLAGS])
+        module.main()
+    assert [config.env for config in configs] == [HDPEnv(n_blocks=2, waypoints_per_pose=1)] * 3
+    monkeypatch.setattr(sys, "argv", ["record", "--dataset.repo_id=t/t", "--env.type=aloha"])
+    with pytest.raises(SystemExit, match=r"--env.type=aloha has no experts, only --env.type=hdp has$"):
+        module.main()
+
+
 def test_all_workers_have_work_in_a_short_recording_or_the_command_says_so(tmp_path, caplog):
     assert all(len(shard_starts(n)) >= min(n, 8) for n in range(1, 500))
     config = RecordConfig(RecordDatasetConfig("test/few", tmp_path / "few", num_episodes=3), num_workers=4)
@@ -114,14 +175,18 @@ def test_all_workers_have_work_in_a_short_recording_or_the_command_says_so(tmp_p
     assert [record.message for record in caplog.records] == ["only 3 of 4 workers have work: 3 episodes are few"]
 
 
-def flags_of_80(root: Path) -> tuple[str, ...]:
-    return (*TASK_FLAGS, "--dataset.repo_id=t/t", f"--dataset.root={root}", "--dataset.num_episodes=80")
+def config_of(num_episodes: int, root: Path) -> RecordConfig:
+    return RecordConfig(RecordDatasetConfig("t/t", root, num_episodes), HDPEnv(n_blocks=2, waypoints_per_pose=1))
+
+
+def flags_of(num_episodes: int, root: Path) -> tuple[str, ...]:
+    return (*TASK_FLAGS, "--dataset.repo_id=t/t", f"--dataset.root={root}", f"--dataset.num_episodes={num_episodes}")
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("datasets") / "uninterrupted"
-    run_command("hdp-record", *flags_of_80(root))
+    record(config_of(80, root))
     return root
 
 
@@ -130,7 +195,7 @@ def uninterrupted(tmp_path_factory) -> Path:
     [(signal.SIGTERM, 1), (signal.SIGKILL, 1), (signal.SIGTERM, 2), (signal.SIGKILL, 2), (signal.SIGINT, 2)],
 )
 def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_path, signal_number, num_workers):
-    flags = flags_of_80(tmp_path / "stopped")
+    config, flags = config_of(80, tmp_path / "stopped"), flags_of(80, tmp_path / "stopped")
     command = [Path(sys.executable).with_name("hdp-record"), *flags, f"--num_workers={num_workers}"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     first_shard_done = tmp_path / "stopped.partial" / "episodes_000000.done"
@@ -152,13 +217,25 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_pa
     assert load_info(first_shard_done.with_suffix("")).total_episodes == 10
     assert sum(load_info(shard).total_episodes for shard in shards) < 80
 
+    with pytest.raises(FileExistsError, match="--resume=true"):
+        record(config)
+    record(replace(config, resume=True))
+    assert_same_dataset(tmp_path / "stopped", uninterrupted)
+    assert load_info(config.root).features["observation.symbolic_plan"]["info"]["num_episodes"] == 80
+    assert not config.partial_root.exists()
+
+
+def test_the_command_goes_on_with_an_interrupted_recording_only_when_told_to(tmp_path):
+    config, flags = config_of(2, tmp_path / "stopped"), flags_of(2, tmp_path / "stopped")
+    first_shard, _ = plan_shards(config)
+    record_shard(config, first_shard)
     refused = run_command("hdp-record", *flags, check=False)
     assert refused.returncode == 1
     assert refused.stderr.count("\n") == 1
     assert "--resume=true" in refused.stderr
     run_command("hdp-record", *flags, "--resume=true")
-    assert_same_dataset(tmp_path / "stopped", uninterrupted)
-    assert not (tmp_path / "stopped.partial").exists()
+    assert load_info(config.root).total_episodes == 2
+    assert not config.partial_root.exists()
 
 
 def test_ctrl_c_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch):
@@ -264,20 +341,31 @@ def test_failed_demonstrations_are_dropped_and_counted(tmp_path, monkeypatch, ca
 
 
 @pytest.mark.parametrize(
-    ("flags", "message"),
+    ("flag", "message"),
     [
-        (("--env.task=Juggling-v0",), "is not a task of --env.type=hdp"),
-        (("--env.n_blocks=1",), "n_blocks must be in [2, 8]"),
-        (("--dataset.num_episodes=0",), "must be at least 1"),
-        (("--dataset.root=/dev/null/dataset",), "Not a directory"),
+        ("--env.task=Juggling-v0", "is not a task of --env.type=hdp"),
+        ("--env.n_blocks=1", "n_blocks must be in [2, 8]"),
+        ("--dataset.num_episodes=0", "must be at least 1"),
+        ("--seed=-1", "--seed must be at least 0, got -1"),
+        ("--dataset.root=/dev/null/dataset", "Not a directory"),
     ],
 )
-def test_bad_flags_are_one_line_and_leave_nothing_behind(tmp_path, flags, message):
-    root = tmp_path / "nothing"
-    result = run_command("hdp-record", "--dataset.repo_id=t/t", f"--dataset.root={root}", *flags, check=False)
-    assert result.returncode != 0
-    assert message in result.stderr.splitlines()[-1]
-    assert "Traceback" not in result.stderr
+def test_bad_flags_are_one_line_and_leave_nothing_behind(tmp_path, monkeypatch, flag, message):
+    flags = ("--dataset.repo_id=t/t", f"--dataset.root={tmp_path / 'nothing'}", flag)
+    monkeypatch.setattr(sys, "argv", ["hdp-record", *flags])
+    monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
+    with pytest.raises(SystemExit) as end:
+        recorder.main()
+    assert message in end.value.code
+    assert "\n" not in end.value.code
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bad_flag_ends_the_command_with_an_error(tmp_path):
+    flags = ("--dataset.repo_id=t/t", f"--dataset.root={tmp_path / 'nothing'}", "--env.n_blocks=1")
+    result = run_command("hdp-record", *flags, check=False)
+    assert result.returncode == 1
+    assert result.stderr.splitlines() == ["hdp-record: n_blocks must be in [2, 8], got 1"]
     assert list(tmp_path.iterdir()) == []
 
 
