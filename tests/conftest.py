@@ -1,26 +1,35 @@
 """What several test files share: a recorded dataset, and a policy made for it."""
 
+import contextlib
+import io
+import logging
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
+from unittest import mock
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from huggingface_hub import constants
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.parser import get_cli_overrides  # noqa: F401 (imports LeRobot once, before the timers of pytest)
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.scripts import lerobot_train
 
 import lerobot_policy_hdp  # noqa: F401 (registers the policy and the environments)
 from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import sort_blocks_2d
 from lerobot_hdp import HDPConfig
 from lerobot_hdp.modeling_hdp import HDPPolicy
+
+torch.set_num_threads(1)  # as in the commands that tests run: weights are compared
 
 REPOSITORY = Path(__file__).parents[1]
 N_EPISODES = 30
@@ -50,6 +59,23 @@ def run_command(command: str, *arguments, check: bool = True, cwd: Path | None =
     if check and result.returncode:
         raise AssertionError(f"{command} failed:\n{result.stdout[-2000:]}\n{result.stderr[-6000:]}")
     return result
+
+
+def call_command(main: Callable[[], None], *arguments) -> str:
+    """Call a command in this process, which saves its start, without a network; what it wrote to stderr.
+
+    What it leaves behind is undone: LeRobot's logging, and the names that `hdp-train` replaces in LeRobot's module.
+    """
+    stderr = io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", [main.__module__, *map(str, arguments)]),
+        mock.patch.object(constants, "HF_HUB_OFFLINE", True),
+        mock.patch.object(logging.getLogger(), "handlers", []),
+        mock.patch.dict(vars(lerobot_train)),
+        contextlib.redirect_stderr(stderr),
+    ):
+        main()
+    return stderr.getvalue()
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 import warnings
 
 import pytest
@@ -22,7 +21,7 @@ from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp import PlanPrompt
 from lerobot_hdp.prompt import encode_prompt
 
-from .conftest import HORIZON, TASK_FLAGS, TINY_PLANNER, observation, train_in_process
+from .conftest import HORIZON, TASK_FLAGS, TINY_PLANNER, call_command, observation, train_in_process
 
 CONTINUOUS_SYMBOLS = ["joint_diffuser", "separate_diffuser"]
 WITH_SYMBOLS = ["hdp", *CONTINUOUS_SYMBOLS]
@@ -224,15 +223,11 @@ class TestContract:
         assert all(state.motion.shape == (4, HORIZON, 3) for _, state in states)
         assert torch.equal(states[-1][1].motion, plan.actions)
 
-    def test_lerobot_trains_resumes_and_evaluates_it(self, dataset_root, planner, tmp_path, monkeypatch):
+    def test_lerobot_trains_resumes_and_evaluates_it(self, dataset_root, planner, tmp_path):
         """LeRobot's own commands, called in this process to save their start."""
 
-        def run(command, *arguments):
-            monkeypatch.setattr(sys, "argv", [command.__module__, *map(str, arguments)])
-            command()
-
         whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-        run(
+        call_command(
             lerobot_train.main,
             "--dataset.repo_id=test/sorting",
             f"--dataset.root={dataset_root}",
@@ -254,7 +249,7 @@ class TestContract:
         shutil.copytree(whole / "checkpoints/000005", stopped / "checkpoints/000005")
         (stopped / "checkpoints/last").symlink_to("000005")
         config = stopped / "checkpoints/last/pretrained_model/train_config.json"
-        run(lerobot_train.main, f"--config_path={config}", "--resume=true", f"--output_dir={stopped}")
+        call_command(lerobot_train.main, f"--config_path={config}", "--resume=true", f"--output_dir={stopped}")
         checkpoint = stopped / "checkpoints/000008/pretrained_model"
         first, second = (
             load_file(run_dir / "checkpoints/000008/pretrained_model/model.safetensors") for run_dir in (whole, stopped)
@@ -262,7 +257,7 @@ class TestContract:
         assert first.keys() == second.keys()
         assert all(torch.equal(first[key], second[key]) for key in first)
 
-        run(
+        call_command(
             lerobot_eval.main,
             f"--policy.path={checkpoint}",
             "--env.type=hdp",

@@ -127,14 +127,6 @@ def test_loss_is_the_weighted_sum_of_its_logged_parts(make_planner, batch):
     assert loss.item() == pytest.approx(parts["motion_loss"] + 0.25 * parts["symbol_loss"], rel=1e-5)
 
 
-def test_both_losses_fall_in_training(make_planner, batch):
-    policy, preprocessor, _ = make_planner(ema_max_decay=0)
-    history = train_in_process(policy, preprocessor(batch), steps=60)
-    for name in ("motion_loss", "symbol_loss"):
-        first, last = (sum(parts[name] for parts in part) for part in (history[:10], history[-10:]))
-        assert last < 0.7 * first
-
-
 @pytest.mark.parametrize("lead_share", [0.0, 1.0])
 @pytest.mark.parametrize("policy_type", ["hdp", "separate_diffuser", "joint_diffuser"])
 def test_training_shows_symbols_that_lead_as_often_as_it_is_told(make_planner, batch, policy_type, lead_share):
@@ -151,15 +143,11 @@ def test_training_shows_symbols_that_lead_as_often_as_it_is_told(make_planner, b
         assert symbol_levels.min() < 0.5
 
 
-def test_a_plan_is_whole_and_holds_no_mask(make_planner, batch):
-    policy, preprocessor, postprocessor = make_planner()
-    plan = policy.eval().plan(observation(preprocessor(batch)))
-    assert plan.actions.shape == (4, HORIZON, 3)
-    assert plan.token_ids.shape == plan.token_probabilities.shape == (4, 18)
-    assert plan.token_ids.max() < len(policy.vocabulary)
-    assert ((plan.token_probabilities > 0) & (plan.token_probabilities <= 1)).all()
-    assert plan.actions.abs().max() <= 1
-    assert postprocessor(plan.actions).shape == plan.actions.shape
+def test_each_token_of_a_plan_has_a_probability(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    probabilities = policy.eval().plan(observation(preprocessor(batch))).token_probabilities
+    assert probabilities.shape == (4, 18)
+    assert ((probabilities > 0) & (probabilities <= 1)).all()
 
 
 @pytest.mark.parametrize("sampler", ["ddpm", "ddim", "confidence"])
