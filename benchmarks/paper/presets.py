@@ -90,8 +90,8 @@ PRESETS: dict[str, Preset] = {
         starts=50,
         average_last=10,
     ),
-    # Ours: the paper's network, with our training and sampler, and so far fewer steps. At the preset's learning rate, the
-    # symbols of arranging are not learned until it has decayed.
+    # Ours: the paper's network, with our training and sampler, and so far fewer steps. In arranging, the preset's learning
+    # rate is too large for it: the symbols' loss stays where it is until the rate has decayed.
     "default": Preset(
         policy={"preset": "default", "dtype": "bfloat16"},
         tasks={
