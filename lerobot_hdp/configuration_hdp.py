@@ -37,7 +37,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "observation_weight_std": 0.5,
         "symbol_loss_weight": 1 / 300,
         "optimizer_type": "muon",
-        "optimizer_lr": 3e-3,
+        "optimizer_lr": 1e-3,
         "scheduler_warmup_steps": 100,
         "sampler": "confidence",
         "symbol_lead": 0.5,
@@ -121,7 +121,9 @@ class HDPConfig(PreTrainedConfig):
 
         optimizer_type: `muon` updates the matrices between hidden layers by Muon and the rest by AdamW (optimizer.py),
             `adamw` all by AdamW.
-        optimizer_*, scheduler_*: of these, with a linear warm-up and a cosine decay to the last step.
+        optimizer_*, scheduler_*: of these, with a linear warm-up and a cosine decay to the last step. The preset's
+            learning rate is one for the network that is the default; smaller ones, as in `configs/`, learn faster with
+            3e-3, which is too much for it (docs/tasks/xarm_arrange_blocks.md).
             `optimizer_betas`, `optimizer_eps`: of AdamW; `optimizer_momentum`: of Muon; `optimizer_fused`: AdamW
             updates all parameters in one kernel; None: on CUDA.
 

@@ -38,6 +38,7 @@ HORIZON = 19
 
 TASK_FLAGS = ("--env.task=BlockSorting2D-v0", "--env.n_blocks=2", "--env.waypoints_per_pose=1")
 TINY_PLANNER = {"horizon": HORIZON, "num_layers": 1, "num_heads": 2, "width": 32, "num_train_timesteps": 10}
+TINY_PLANNER |= {"optimizer_lr": 3e-3}
 
 DIFFUSION_FLAGS = ("--policy.type=diffusion", "--policy.down_dims=[16,32]", "--policy.use_group_norm=true")
 DIFFUSION_FLAGS += ("--policy.pretrained_backbone_weights=null",)

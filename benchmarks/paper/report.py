@@ -85,8 +85,8 @@ def write_report(page: Path = DOCS / "results.md") -> list[Path]:
         latency(),
         "## Training time\n",
         f"The paper: {published.TRAINING}. Ours, in minutes and samples a second: wall time of `hdp-train`, its start "
-        "and its checkpoints included. Other cells may have used the machine at the same time, those of the H200 all "
-        "did: eight trainings shared it.\n",
+        "and its checkpoints included. Other work may have used the machine at the same time, as on the H200, which "
+        "eight trainings shared.\n",
         training_time(results),
         "## What HDP's failures are\n",
         "In the evaluations that count.\n",
