@@ -4,6 +4,7 @@ import contextlib
 import io
 import logging
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -30,6 +31,7 @@ from lerobot_hdp import HDPConfig
 from lerobot_hdp.modeling_hdp import HDPPolicy
 
 torch.set_num_threads(1)  # as in the commands that tests run: weights are compared
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore Ctrl-C, which tests send
 
 REPOSITORY = Path(__file__).parents[1]
 N_EPISODES = 30
