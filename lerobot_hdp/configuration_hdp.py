@@ -74,12 +74,13 @@ class HDPConfig(PreTrainedConfig):
         preset: `default` (measures best) or `paper` (the paper's values). It fills the fields below that are None;
             what is set explicitly stays. A checkpoint has all of them set: there it changes nothing.
 
-        horizon: number of actions in a plan (H_c): the length of the dataset's episodes.
+        horizon: number of actions in a plan (H_c): the length of the dataset's longest episode.
         symbolic_horizon: number of tokens in a plan (H_d). None: that of the dataset. Longer: filled with PAD.
         n_action_steps: actions that are executed before the next plan is made, with `plan_from=any_frame`. None: the
             whole plan, open loop.
-        plan_from: `episode_start` trains on the whole plan at the first frame of each episode, which must all be
-            `horizon` frames long; `any_frame` on what remains of the plan at any frame, held at its end.
+        plan_from: `episode_start` trains on the whole plan at the first frame of each episode, `any_frame` on what
+            remains of the plan at any frame; both hold the last action where an episode ends before the plan does.
+            `lerobot-train` leaves out episodes that are shorter than a whole plan, `hdp-train` does not.
         vocabulary: the symbols, PAD first; read from the dataset.
 
         num_layers, num_heads, width, dropout: the transformer; `width` is the size of a token.
@@ -331,7 +332,7 @@ class HDPConfig(PreTrainedConfig):
     @property
     def _known_horizon(self) -> int:
         if self.horizon is None:
-            raise ValueError("--policy.horizon is missing: the number of frames of the dataset's episodes")
+            raise ValueError("--policy.horizon is missing: the number of frames of the dataset's longest episode")
         return self.horizon
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:

@@ -1,8 +1,9 @@
 """The planner as a LeRobot policy."""
 
+import logging
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial, wraps
 from typing import Any
@@ -89,8 +90,7 @@ class HDPPolicy(PreTrainedPolicy):
         config: the planner's configuration, complete with what the dataset says.
         dataset_stats: of the dataset that the policy is to be trained on; see `widen_narrow_ranges`. LeRobot makes the
             normaliser of the same ones afterwards, in fine-tuning too.
-        dataset_meta: metadata of the dataset that the policy is to be trained on; its episodes are checked against
-            the horizon.
+        dataset_meta: metadata of the dataset that the policy is to be trained on: what its samples are checked against.
     """
 
     config_class = HDPConfig
@@ -104,8 +104,10 @@ class HDPPolicy(PreTrainedPolicy):
         widen_narrow_ranges(config, dataset_stats or {})
         if config.num_candidates > 1 and not self.can_score:
             raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
-        if dataset_meta is not None:
+        self._plan_starts: Tensor | None = None
+        if dataset_meta is not None and config.plan_from == "episode_start":
             _check_episodes_fit(config, dataset_meta.episodes["length"])
+            self._plan_starts = torch.tensor(dataset_meta.episodes["dataset_from_index"])
         self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
         self.motion_process, self.symbol_process = make_processes(config)
 
@@ -175,11 +177,9 @@ class HDPPolicy(PreTrainedPolicy):
         LeRobot evaluates the loss at every frame of the held-out episodes (`hdp-train`, where plans begin), and
         streams all frames of a dataset, whatever `drop_n_last_frames` says.
         """
-        is_pad = batch.get(f"{ACTION}_is_pad")
-        if self.config.plan_from != "episode_start" or is_pad is None:
+        if self._plan_starts is None or "index" not in batch:
             return False
-        # HD's last segment may end after the horizon, and so hold padding in every sample.
-        return bool(is_pad[:, : self.config.horizon].any())
+        return not torch.isin(batch["index"].cpu(), self._plan_starts).all()
 
     def _next_step(self) -> tuple[int, int]:
         """Count a training step: `noise_seed` and `forward_calls`.
@@ -548,15 +548,20 @@ def _rank_and_world_size() -> tuple[int, int]:
     return torch.distributed.get_rank(), torch.distributed.get_world_size()
 
 
-def _check_episodes_fit(config: HDPConfig, lengths: Iterable[int]) -> None:
-    """Whole plans need episodes of exactly the horizon's length.
+def _check_episodes_fit(config: HDPConfig, lengths: Sequence[int]) -> None:
+    """No episode may be longer than the plans that are to hold it.
 
     LeRobot gives a policy the metadata of all episodes, and does not say which of them it trains on.
     """
-    lengths = set(lengths)
-    if config.plan_from == "episode_start" and lengths != {config.horizon}:
+    if max(lengths) > config.horizon:
         raise ValueError(
-            f"the dataset's episodes have {min(lengths)} to {max(lengths)} frames, the planner's horizon is "
-            f"{config.horizon}. Set --policy.horizon to the episodes' length; if they differ among each other, let the "
-            "shorter ones hold their last waypoint. Episodes that --dataset.episodes leaves out count, too."
+            f"the dataset's episodes have {min(lengths)} to {max(lengths)} frames, more than --policy.horizon="
+            f"{config.horizon}: a plan holds the whole episode. Set it to the length of the longest (episodes that "
+            "--dataset.episodes leaves out count, too)."
         )
+    if shorter := sum(length < config.horizon for length in lengths):
+        logging.warning(
+            "%d of %d episodes are shorter than --policy.horizon=%d: with hdp-train they hold their last action; "
+            "lerobot-train leaves them out.",
+            shorter, len(lengths), config.horizon,
+        )  # fmt: skip

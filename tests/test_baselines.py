@@ -57,13 +57,12 @@ class HostReads(TorchDispatchMode):
 
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_a_held_out_loss_warns_of_partial_plans_alone(make_planner, training_batch, planner):
-    """HD's and CHD's last segment ends after the horizon, in padding."""
     policy, preprocessor, _ = make_planner(planner)
     whole = preprocessor(training_batch(policy))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         policy.eval().forward(whole)
-    partial = {**whole, "action_is_pad": torch.ones_like(whole["action_is_pad"])}
+    partial = {**whole, "index": whole["index"] + 1}
     with pytest.warns(UserWarning, match="eval_loss says nothing"):
         policy.forward(partial)
 

@@ -284,6 +284,32 @@ def test_the_held_out_loss_is_that_of_whole_plans(dataset_root, tmp_path):
     assert losses(in_memory)[:STEPS] == losses(by_lerobot)[:STEPS]
 
 
+def record_noise(root, lengths, hold_until=0) -> Path:
+    """Episodes of noise, which stay where they end until some frame."""
+    vector = {"dtype": "float32", "shape": (3,), "names": None}
+    features = {"observation.state": vector, "action": vector}
+    dataset = LeRobotDataset.create("test/dataset", fps=FPS, root=root, features=features, use_videos=False)
+    generator = np.random.default_rng(0)
+    for length in lengths:
+        states, actions = generator.random((2, length, 3), dtype=np.float32)
+        for frame in range(max(length, hold_until)):
+            at = min(frame, length - 1)
+            dataset.add_frame({"observation.state": states[at], "action": actions[at], "task": "move"})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def test_shorter_episodes_hold_their_last_action(tmp_path):
+    short = record_noise(tmp_path / "short", (7, 4, 9, 5))
+    held = record_noise(tmp_path / "held", (7, 4, 9, 5), hold_until=9)
+    flags = ("--policy.type=diffuser", *PLANNER_FLAGS[1:], "--policy.horizon=9")
+    log = train(hdp_train.main, short, tmp_path / "run", flags, "--batch_size=3")
+    assert "3 of 4 episodes are shorter than --policy.horizon=9" in log
+    assert losses(log) == losses(train(hdp_train.main, held, tmp_path / "expected", flags, "--batch_size=3"))
+    assert_same_weights(weights(tmp_path / "run"), weights(tmp_path / "expected"))
+
+
 def test_a_job_elsewhere_is_refused():
     flags = ("--dataset.repo_id=test/dataset", *PLANNER_FLAGS, "--job.target=l4x1")
     result = run_command("hdp-train", *flags, check=False)

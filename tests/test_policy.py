@@ -497,10 +497,10 @@ class TestBadInput:
         with pytest.raises(ValueError, match=r"the settings do not fit the weights in .*decoder\.layers\.1"):
             HDPPolicy.from_pretrained(tmp_path, config=policy.config)
 
-    def test_a_horizon_that_is_not_the_episodes(self, make_planner):
-        message = r"episodes have 19 to 19 frames, the planner's horizon is 20.* --dataset.episodes leaves out count"
+    def test_episodes_longer_than_the_horizon(self, make_planner):
+        message = r"episodes have 19 to 19 frames, more than --policy.horizon=18.* --dataset.episodes leaves out count"
         with pytest.raises(ValueError, match=message):
-            make_planner(horizon=20)
+            make_planner(horizon=18)
 
     def test_no_horizon(self):
         with pytest.raises(ValueError, match=r"--policy.horizon is missing"):

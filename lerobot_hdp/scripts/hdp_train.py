@@ -3,8 +3,9 @@
 Takes all flags of `lerobot-train`, and does what it does with them, from checkpoints to `--resume` and `accelerate
 launch`: it runs LeRobot's training function. What it changes are some names in LeRobot's module, below, where LeRobot
 0.6.1 has no hook: the functions that open the datasets, collate a batch with language columns, write a checkpoint and
-submit a job, and, for `--max_train_minutes`, those that decide about a checkpoint and do a step. A `dataset_factory`
-and a `should_stop` argument of `lerobot.scripts.lerobot_train.train` would make this unnecessary.
+submit a job, for planners of whole episodes the sampler, and for `--max_train_minutes` those that decide about a
+checkpoint and do a step. A `dataset_factory`, a `sampler_factory` and a `should_stop` argument of
+`lerobot.scripts.lerobot_train.train` would make this unnecessary.
 
 Example:
     hdp-train --config_path=configs/xarm_sorting.json --max_train_minutes=30
@@ -21,7 +22,7 @@ import datasets
 import numpy as np
 import torch
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
 from lerobot.utils.collate import lerobot_collate_fn
 from torch.distributed import ProcessGroup
@@ -65,14 +66,37 @@ def hold_datasets_in_memory(max_gib: float) -> None:
     lerobot_train.lerobot_collate_fn = collate_unless_collated
 
 
-def evaluate_where_plans_begin() -> None:
-    """Let `lerobot-train` take the held-out loss of planners of whole episodes at the first frames of these alone."""
+class FirstFrameSampler(EpisodeAwareSampler):
+    """LeRobot's sampler, of the first frame of each episode, however long it is.
+
+    Args:
+        dataset_from_indices: first frame of each episode.
+        dataset_to_indices: its end.
+        drop_n_last_frames: what LeRobot's would leave out, which of equally long episodes leaves the first frame.
+        kwargs: see `EpisodeAwareSampler`.
+    """
+
+    def __init__(
+        self, dataset_from_indices: list[int], dataset_to_indices: list[int], drop_n_last_frames: int = 0, **kwargs: Any
+    ):
+        first = np.asarray(dataset_from_indices)
+        super().__init__(first, first + 1, **kwargs)
+
+
+def start_where_plans_begin() -> None:
+    """Let `lerobot-train` show planners of whole episodes their first frames alone, in training and held out.
+
+    So an episode may be shorter than the horizon: LeRobot repeats its last action.
+    """
     make_datasets = lerobot_train.make_train_eval_datasets
 
     def make_datasets_of_first_frames(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, Dataset | None]:
         train, held_out = make_datasets(cfg)
-        if held_out is None or not isinstance(cfg.policy, HDPConfig) or cfg.policy.plan_from != "episode_start":
+        if not isinstance(cfg.policy, HDPConfig) or cfg.policy.plan_from != "episode_start":
             return train, held_out
+        lerobot_train.EpisodeAwareSampler = FirstFrameSampler
+        if held_out is None:
+            return train, None
         columns = held_out.hf_dataset.with_format("numpy")
         frames = np.flatnonzero(columns["frame_index"][:] == 0)
         first_frames = Subset(held_out, frames.tolist())
@@ -192,7 +216,7 @@ def main() -> None:
         parser.print_help()
     lerobot_train.submit_to_hf = refuse_to_submit
     hold_datasets_in_memory(options.max_memory_gib)
-    evaluate_where_plans_begin()
+    start_where_plans_begin()
     process_group = hold_process_group()
     if options.max_train_minutes is not None:
         stop_after(options.max_train_minutes)
