@@ -20,27 +20,35 @@ from lerobot.datasets.dataset_tools import add_features
 from lerobot.utils.constants import ACTION
 
 from gym_hdp_tasks import PAD
+from lerobot_hdp.vocabulary import Vocabulary
 
 from .demonstration import Demonstration, PlanStep
 from .language import SYMBOLIC_PLAN
 
 
 def add_symbolic_plans(
-    dataset: LeRobotDataset, plans: Sequence[Sequence[PlanStep]], repo_id: str, root: Path | str
+    dataset: LeRobotDataset,
+    plans: Sequence[Sequence[PlanStep]],
+    repo_id: str,
+    root: Path | str,
+    vocabulary: Sequence[str] | None = None,
 ) -> LeRobotDataset:
     """Copy a dataset, with what remains of the plan at each frame in the column `observation.symbolic_plan`.
 
-    The vocabulary is PAD and all symbols of the plans, in alphabetical order; a plan is as long as the longest.
+    A plan is as long as the longest.
 
     Args:
         dataset: to be copied, with all its episodes.
         plans: of each episode, its steps in words, and the frame at which each is done.
         repo_id: name of the new dataset.
         root: its folder.
+        vocabulary: all symbols that its plans may have, PAD first; for a planner that is trained on with it, the
+            planner's. None: PAD and the symbols of these plans, in alphabetical order.
 
     Raises:
-        ValueError: there is not one plan for each episode, a step has the word PAD, or the steps of an episode are not
-            done one after the other, between its first frame and its end.
+        ValueError: there is not one plan for each episode, a step has the word PAD or one that the vocabulary lacks, a
+            word cannot be a symbol, or the steps of an episode are not done one after the other, between its first
+            frame and its end.
     """
     if len(plans) != dataset.meta.total_episodes:
         raise ValueError(f"there are {len(plans)} plans for {dataset.meta.total_episodes} episodes")
@@ -51,7 +59,11 @@ def add_symbolic_plans(
             raise ValueError(f"the stops of episode {episode} must strictly increase within 1..{length}, got {stops}")
         if any(PAD in step.symbols for step in plan):
             raise ValueError(f"a step of episode {episode} has the word {PAD}, which only fills plans up")
-    vocabulary = [PAD, *sorted({symbol for plan in plans for step in plan for symbol in step.symbols})]
+    symbols = {symbol for plan in plans for step in plan for symbol in step.symbols}
+    vocabulary = [PAD, *sorted(symbols)] if vocabulary is None else list(vocabulary)
+    Vocabulary(vocabulary)  # whether its words can be symbols
+    if unknown := symbols.difference(vocabulary):
+        raise ValueError(f"the vocabulary {' '.join(vocabulary)} has no {', '.join(sorted(unknown))}")
     symbolic_horizon = max(sum(len(step.symbols) for step in plan) for plan in plans)
     token_ids = []
     for plan, length in zip(plans, lengths, strict=True):

@@ -80,7 +80,7 @@ class HDPConfig(PreTrainedConfig):
             whole plan, open loop.
         plan_from: `episode_start` trains on the whole plan at the first frame of each episode, `any_frame` on what
             remains of the plan at any frame; both hold the last action where an episode ends before the plan does.
-            `lerobot-train` leaves out episodes that are shorter than a whole plan, `hdp-train` does not.
+            With `episode_start`, `lerobot-train` leaves out episodes shorter than the horizon; `hdp-train` does not.
         vocabulary: the symbols, PAD first; read from the dataset.
 
         num_layers, num_heads, width, dropout: the transformer; `width` is the size of a token.

@@ -90,7 +90,8 @@ class HDPPolicy(PreTrainedPolicy):
         config: the planner's configuration, complete with what the dataset says.
         dataset_stats: of the dataset that the policy is to be trained on; see `widen_narrow_ranges`. LeRobot makes the
             normaliser of the same ones afterwards, in fine-tuning too.
-        dataset_meta: metadata of the dataset that the policy is to be trained on: what its samples are checked against.
+        dataset_meta: metadata of the dataset that the policy is to be trained on; its episodes are checked against
+            the horizon.
     """
 
     config_class = HDPConfig
@@ -104,10 +105,8 @@ class HDPPolicy(PreTrainedPolicy):
         widen_narrow_ranges(config, dataset_stats or {})
         if config.num_candidates > 1 and not self.can_score:
             raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
-        self._plan_starts: Tensor | None = None
         if dataset_meta is not None and config.plan_from == "episode_start":
             _check_episodes_fit(config, dataset_meta.episodes["length"])
-            self._plan_starts = torch.tensor(dataset_meta.episodes["dataset_from_index"])
         self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
         self.motion_process, self.symbol_process = make_processes(config)
 
@@ -177,9 +176,10 @@ class HDPPolicy(PreTrainedPolicy):
         LeRobot evaluates the loss at every frame of the held-out episodes (`hdp-train`, where plans begin), and
         streams all frames of a dataset, whatever `drop_n_last_frames` says.
         """
-        if self._plan_starts is None or "index" not in batch:
+        timestamp = batch.get("timestamp")
+        if self.config.plan_from != "episode_start" or timestamp is None:
             return False
-        return not torch.isin(batch["index"].cpu(), self._plan_starts).all()
+        return bool((timestamp > 0).any())
 
     def _next_step(self) -> tuple[int, int]:
         """Count a training step: `noise_seed` and `forward_calls`.
@@ -334,9 +334,11 @@ class HDPPolicy(PreTrainedPolicy):
             generator: source of randomness; None: PyTorch's global one.
 
         Raises:
-            ValueError: an observation with NaN or infinity, or a prompt that does not fit.
+            ValueError: an observation that is missing or holds NaN or infinity, or a prompt that does not fit.
         """
         for key in self.config.input_features:
+            if key not in batch:
+                raise ValueError(f"the planner was trained on {key}, which is not observed here")
             if not torch.isfinite(batch[key]).all():
                 raise ValueError(f"{key} holds NaN or infinity: no plan can be made from it")
         if prompt is None and self.config.prompt:
@@ -549,19 +551,20 @@ def _rank_and_world_size() -> tuple[int, int]:
 
 
 def _check_episodes_fit(config: HDPConfig, lengths: Sequence[int]) -> None:
-    """No episode may be longer than the plans that are to hold it.
+    """A plan holds a whole episode: the longest has the horizon's length, or less in fine-tuning.
 
     LeRobot gives a policy the metadata of all episodes, and does not say which of them it trains on.
     """
-    if max(lengths) > config.horizon:
+    longest, fine_tunes = max(lengths), config.pretrained_path is not None
+    if longest > config.horizon or (longest < config.horizon and not fine_tunes):
+        remedy = "the checkpoint's plans cannot hold them" if fine_tunes else f"set --policy.horizon={longest}"
         raise ValueError(
-            f"the dataset's episodes have {min(lengths)} to {max(lengths)} frames, more than --policy.horizon="
-            f"{config.horizon}: a plan holds the whole episode. Set it to the length of the longest (episodes that "
-            "--dataset.episodes leaves out count, too)."
+            f"the dataset's episodes have up to {longest} frames, the planner's horizon is {config.horizon}: {remedy}. "
+            "Episodes that --dataset.episodes leaves out count, too; lerobot-edit-dataset can delete them."
         )
     if shorter := sum(length < config.horizon for length in lengths):
         logging.warning(
-            "%d of %d episodes are shorter than --policy.horizon=%d: with hdp-train they hold their last action; "
-            "lerobot-train leaves them out.",
+            "%d of %d episodes are shorter than the planner's horizon of %d: with hdp-train they hold their last "
+            "action; lerobot-train leaves them out.",
             shorter, len(lengths), config.horizon,
         )  # fmt: skip

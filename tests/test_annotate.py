@@ -37,6 +37,24 @@ def test_a_planner_trains_on_plans_that_were_written_afterwards(without_plans, t
     assert (trained.vocabulary, trained.symbolic_horizon) == (vocabulary, 5)
 
 
+def test_a_vocabulary_can_be_given(without_plans, tmp_path):
+    plans, vocabulary = [[PICK]] * without_plans.meta.total_episodes, ["PAD", "PICK", "PLACE", "CUP"]
+    with_plans = add_symbolic_plans(without_plans, plans, "test/with", tmp_path / "with", vocabulary)
+    assert with_plans[0]["observation.symbolic_plan"].tolist() == [1, 3]
+    assert with_plans.meta.features["observation.symbolic_plan"]["info"]["vocabulary"] == vocabulary
+
+
+@pytest.mark.parametrize(
+    ("word", "vocabulary", "message"),
+    [("RED CUP", None, "'RED CUP' cannot be a symbol"), ("MUG", ["PAD", "CUP", "PICK"], "has no MUG")],
+)
+def test_a_word_that_is_no_symbol_is_refused(without_plans, tmp_path, word, vocabulary, message):
+    plans = [[PICK, PlanStep((word,), 15)]] * without_plans.meta.total_episodes
+    with pytest.raises(ValueError, match=message):
+        add_symbolic_plans(without_plans, plans, "test/with", tmp_path / "with", vocabulary)
+    assert not (tmp_path / "with").exists()
+
+
 def test_every_episode_needs_a_plan(without_plans, tmp_path):
     with pytest.raises(ValueError, match=r"there are 1 plans for \d+ episodes"):
         add_symbolic_plans(without_plans, [[PICK]], "test/with", tmp_path / "with")

@@ -62,7 +62,7 @@ def test_a_held_out_loss_warns_of_partial_plans_alone(make_planner, training_bat
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         policy.eval().forward(whole)
-    partial = {**whole, "index": whole["index"] + 1}
+    partial = {**whole, "timestamp": whole["timestamp"] + torch.tensor([0.0, 0.1, 0.0, 0.0])}
     with pytest.warns(UserWarning, match="eval_loss says nothing"):
         policy.forward(partial)
 

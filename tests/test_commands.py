@@ -107,9 +107,9 @@ def test_a_checkpoint_can_be_fine_tuned(dataset_root, checkpoint, tmp_path):
 
 def test_training_refuses_what_does_not_fit(dataset_root, tmp_path):
     flags = train_flags(dataset_root, tmp_path / "run")
-    result = run_command("lerobot-train", *flags, "--policy.horizon=15", check=False)
+    result = run_command("lerobot-train", *flags, "--policy.horizon=25", check=False)
     assert result.returncode != 0
-    assert "episodes have 19 to 19 frames, more than --policy.horizon=15" in result.stderr
+    assert "up to 19 frames, the planner's horizon is 25: set --policy.horizon=19" in result.stderr
 
 
 def test_an_output_folder_that_holds_a_run_is_not_overwritten(dataset_root, run):
@@ -230,6 +230,19 @@ def test_hdp_plan_explains_a_recorded_motion(checkpoint, dataset_root, capsys):
     vocabulary = Vocabulary(dataset.meta.features["observation.symbolic_plan"]["info"]["vocabulary"])
     recorded = vocabulary.decode(dataset[2 * HORIZON]["observation.symbolic_plan"])
     assert last in ("the recorded plan says the same", f"recorded: {' '.join(recorded)}")
+
+
+def test_hdp_plan_explains_an_episode_shorter_than_its_plans(checkpoint, dataset, tmp_path, capsys):
+    features = {key: dataset.features[key] for key in ("observation.state", "observation.environment_state", "action")}
+    options = {"fps": dataset.fps, "root": tmp_path / "short", "features": features, "use_videos": False}
+    short = LeRobotDataset.create("test/short", **options)
+    for row in dataset.hf_dataset.select(range(12)):
+        short.add_frame({**{key: row[key] for key in features}, "task": "sort"})
+    short.save_episode()
+    short.finalize()
+    source = ("--dataset.repo_id=test/short", f"--dataset.root={short.root}")
+    call_command(hdp_plan.main, f"--policy.path={checkpoint}", *source, "--explain=0")
+    assert "episode 0:\n    waypoints 0-6 " in capsys.readouterr().out
 
 
 def test_hdp_plan_explains_a_dataset_without_symbols_and_without_a_task(checkpoint, dataset_root, tmp_path, capsys):

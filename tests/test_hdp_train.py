@@ -300,14 +300,37 @@ def record_noise(root, lengths, hold_until=0) -> Path:
     return root
 
 
-def test_shorter_episodes_hold_their_last_action(tmp_path):
-    short = record_noise(tmp_path / "short", (7, 4, 9, 5))
-    held = record_noise(tmp_path / "held", (7, 4, 9, 5), hold_until=9)
+@pytest.mark.parametrize("extra", [("diffuser",), ("hd",), ("diffuser", "--max_memory_gib=0")], ids=" ".join)
+def test_shorter_episodes_hold_their_last_action(tmp_path, extra):
+    policy_type, *options = extra
+    flags = (f"--policy.type={policy_type}", *PLANNER_FLAGS[1:], "--policy.horizon=9", *options)
+    flags += ("--dataset.eval_split=0.25", f"--eval_steps={STEPS}")
+    logs = {}
+    for name, hold_until in {"held": 9, "short": 0}.items():
+        root = record_noise(tmp_path / name, (7, 4, 9, 5), hold_until)
+        logs[name] = train(hdp_train.main, root, tmp_path / f"{name}_run", flags, "--batch_size=2")
+    assert "3 of 4 episodes are shorter than the planner's horizon of 9" in logs["short"]
+    assert len(losses(logs["short"])) == STEPS + 1
+    assert losses(logs["short"]) == losses(logs["held"])
+    assert_same_weights(weights(tmp_path / "short_run"), weights(tmp_path / "held_run"))
+
+
+def test_a_run_on_shorter_episodes_goes_on_where_it_stopped(tmp_path):
+    root = record_noise(tmp_path / "short", (7, 4, 9, 5))
     flags = ("--policy.type=diffuser", *PLANNER_FLAGS[1:], "--policy.horizon=9")
-    log = train(hdp_train.main, short, tmp_path / "run", flags, "--batch_size=3")
-    assert "3 of 4 episodes are shorter than --policy.horizon=9" in log
-    assert losses(log) == losses(train(hdp_train.main, held, tmp_path / "expected", flags, "--batch_size=3"))
-    assert_same_weights(weights(tmp_path / "run"), weights(tmp_path / "expected"))
+    train(hdp_train.main, root, tmp_path / "run", flags, "--batch_size=2", "--save_freq=3")
+    expected = weights(tmp_path / "run")
+    config = tmp_path / "run/checkpoints/000003/pretrained_model/train_config.json"
+    call_command(hdp_train.main, f"--config_path={config}", "--resume=true")
+    assert_same_weights(weights(tmp_path / "run"), expected)
+
+
+def test_planners_that_begin_anywhere_train_on_every_frame(tmp_path):
+    root = record_noise(tmp_path / "short", (7, 4, 9, 5))
+    flags = ("--policy.type=diffuser", *PLANNER_FLAGS[1:], "--policy.plan_from=any_frame", "--policy.horizon=9")
+    logs = [train(script.main, root, tmp_path / script.__name__, flags) for script in (lerobot_train, hdp_train)]
+    assert len(losses(logs[0])) == STEPS
+    assert losses(logs[0]) == losses(logs[1])
 
 
 def test_a_job_elsewhere_is_refused():

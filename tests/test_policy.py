@@ -483,7 +483,7 @@ class TestBadInput:
 
     def test_training_samples_from_the_middle_of_an_episode(self, make_planner, dataset):
         """As `--dataset.streaming=true` gives them, whatever `drop_n_last_frames` says."""
-        middle = default_collate([dataset[1], dataset[2]])
+        middle = default_collate([dataset[0], dataset[1]])
         policy, preprocessor, _ = make_planner()
         with pytest.raises(ValueError, match=r"--dataset\.streaming=false"):
             policy.train().forward(preprocessor(middle))
@@ -497,10 +497,24 @@ class TestBadInput:
         with pytest.raises(ValueError, match=r"the settings do not fit the weights in .*decoder\.layers\.1"):
             HDPPolicy.from_pretrained(tmp_path, config=policy.config)
 
-    def test_episodes_longer_than_the_horizon(self, make_planner):
-        message = r"episodes have 19 to 19 frames, more than --policy.horizon=18.* --dataset.episodes leaves out count"
+    @pytest.mark.parametrize("horizon", [18, 20])
+    def test_a_horizon_that_is_not_the_episodes(self, make_planner, horizon):
+        message = f"up to 19 frames, the planner's horizon is {horizon}: set --policy.horizon=19.* leaves out count"
         with pytest.raises(ValueError, match=message):
-            make_planner(horizon=18)
+            make_planner(horizon=horizon)
+
+    def test_fine_tuning_on_longer_episodes_than_its_plans(self, make_planner, dataset, tmp_path):
+        policy, *_ = make_planner()
+        policy.config.horizon, policy.config.pretrained_path = 18, tmp_path
+        with pytest.raises(ValueError, match="horizon is 18: the checkpoint's plans cannot hold them"):
+            HDPPolicy(policy.config, dataset_meta=dataset.meta)
+
+    def test_an_observation_that_is_missing(self, make_planner, batch):
+        policy, preprocessor, _ = make_planner()
+        inputs = observation(preprocessor(batch))
+        del inputs["observation.environment_state"]
+        with pytest.raises(ValueError, match=r"trained on observation[.]environment_state, which is not observed"):
+            policy.eval().select_action(inputs)
 
     def test_no_horizon(self):
         with pytest.raises(ValueError, match=r"--policy.horizon is missing"):

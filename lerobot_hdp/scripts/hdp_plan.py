@@ -82,7 +82,10 @@ class PlanConfig:
         self.env = self.env or trained.env
         self.dataset = self.dataset or trained.dataset
         if self.explain is None and self.env is None:
-            raise ValueError("the checkpoint names no task: choose one with --env.type=hdp --env.task=...")
+            raise ValueError(
+                "the checkpoint names no simulated task: choose one with --env.type=hdp --env.task=...; without one, "
+                "plan in Python (README) or explain a recorded motion with --explain"
+            )
         if self.explain is not None and (self.prompt or self.html or self.check):
             raise ValueError("--explain goes without --prompt, --html and --check: nothing is planned")
 
@@ -222,10 +225,12 @@ def explain(config: PlanConfig) -> str:
         raise ValueError(f"--explain={config.explain}: the dataset has the episodes 0 to {dataset.num_episodes - 1}")
     episode = dataset.meta.episodes[config.explain]
     first, stop = episode["dataset_from_index"], episode["dataset_to_index"]
-    if stop - first != policy.config.horizon:
+    if stop - first > policy.config.horizon:
         raise ValueError(f"the episode has {stop - first} frames, the planner's horizon is {policy.config.horizon}")
-    item = dataset[first]
-    actions = torch.stack([dataset[index]["action"] for index in range(first, stop)])
+    frames = dataset.hf_dataset[first:stop]
+    item = {key: values[0] for key, values in frames.items()}
+    actions = torch.stack(list(frames["action"]))
+    actions = torch.cat([actions, actions[-1:].expand(policy.config.horizon - len(actions), -1)])
     observed = {key: item[key][None] for key in policy.config.input_features}
     batch = preprocessor({**observed, "action": actions[None]})
     plan = policy.plan(batch, PlanPrompt(actions=batch["action"]))

@@ -1,11 +1,13 @@
 """`hdp-train`: LeRobot's own training, with the dataset in memory, for any policy and any dataset that fits.
 
 Takes all flags of `lerobot-train`, and does what it does with them, from checkpoints to `--resume` and `accelerate
-launch`: it runs LeRobot's training function. What it changes are some names in LeRobot's module, below, where LeRobot
-0.6.1 has no hook: the functions that open the datasets, collate a batch with language columns, write a checkpoint and
-submit a job, for planners of whole episodes the sampler, and for `--max_train_minutes` those that decide about a
-checkpoint and do a step. A `dataset_factory`, a `sampler_factory` and a `should_stop` argument of
-`lerobot.scripts.lerobot_train.train` would make this unnecessary.
+launch`: it runs LeRobot's training function. Beyond that, planners of whole episodes train on episodes shorter than
+their plans, too, and their held-out loss is that of whole plans.
+
+What it changes are some names in LeRobot's module, below, where LeRobot 0.6.1 has no hook: the functions that open the
+datasets, collate a batch with language columns, write a checkpoint and submit a job, for planners of whole episodes the
+sampler, and for `--max_train_minutes` those that decide about a checkpoint and do a step. A `dataset_factory`, a
+`sampler_factory` and a `should_stop` argument of `lerobot.scripts.lerobot_train.train` would make this unnecessary.
 
 Example:
     hdp-train --config_path=configs/xarm_sorting.json --max_train_minutes=30
@@ -92,11 +94,10 @@ def start_where_plans_begin() -> None:
 
     def make_datasets_of_first_frames(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, Dataset | None]:
         train, held_out = make_datasets(cfg)
-        if not isinstance(cfg.policy, HDPConfig) or cfg.policy.plan_from != "episode_start":
+        whole_plans = isinstance(cfg.policy, HDPConfig) and cfg.policy.plan_from == "episode_start"
+        lerobot_train.EpisodeAwareSampler = FirstFrameSampler if whole_plans else EpisodeAwareSampler
+        if held_out is None or not whole_plans:
             return train, held_out
-        lerobot_train.EpisodeAwareSampler = FirstFrameSampler
-        if held_out is None:
-            return train, None
         columns = held_out.hf_dataset.with_format("numpy")
         frames = np.flatnonzero(columns["frame_index"][:] == 0)
         first_frames = Subset(held_out, frames.tolist())
