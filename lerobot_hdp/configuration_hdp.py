@@ -263,6 +263,8 @@ class HDPConfig(PreTrainedConfig):
         for key in self.image_features:
             logging.warning("%s is left out: the planner takes no images yet", key)
             del self.input_features[key]
+        if OBS_ENV_STATE not in self.input_features:
+            logging.warning("There is no %s: the planner does not see where the objects are", OBS_ENV_STATE)
         if self.observation_token_sizes is None:
             self.observation_token_sizes = self._token_sizes(features)
         if self.symbol_process is not None:

@@ -295,6 +295,7 @@ def test_cameras_are_left_out(dataset, caplog):
     assert list(config.input_features) == ["observation.state"]
     assert config.observation_token_sizes == [3]
     assert "observation.images.front is left out" in caplog.text
+    assert "the planner does not see where the objects are" in caplog.text
 
 
 def test_an_open_prompt_stays_open_where_it_is_filled(make_planner, batch):
