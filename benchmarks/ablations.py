@@ -100,7 +100,9 @@ the open gripper: [results](results.md) counts them.
 For the rest, the preset predicts the clean motion, has a condition token for each object, made by large initial
 weights, masks by the linear schedule, has no dropout, trains on whole plans and does not give symbols more weight than
 1/300 (1/1000 is ahead at one learning rate and behind at the other). The moving average of the weights makes no
-difference that two seeds could show, and stays on, as in Diffusion Policy.
+difference that two seeds could show, and stays on, as in Diffusion Policy. Training on plans from any frame shows each
+start once in a plan's length: with five times the steps,
+[two blocks are learned](../benchmarks/results/replanning.json).
 
 **Four blocks**, with one seed, are far from learned at this budget with AdamW. What falls far behind with three blocks
 does so with four: predicting the noise or the velocity, more weight for the symbols, dropout, plans from any frame.

@@ -1,7 +1,7 @@
 """Success of a planner that plans again and again, over the actions that are executed of each plan.
 
-    hdp-train --config_path=configs/block_sorting_2d_2_blocks.json --policy.plan_from=any_frame --steps=5000 --policy.dtype=bfloat16 \
-      --output_dir=outputs/train/any_frame
+    hdp-train --config_path=configs/block_sorting_2d_2_blocks.json --policy.plan_from=any_frame --steps=5000 \
+      --policy.dtype=bfloat16 --output_dir=outputs/train/any_frame
     python -m benchmarks.replanning outputs/train/any_frame/checkpoints/last/pretrained_model
 
 By `lerobot-eval`, on the same fresh starts of sorting in the plane. Writes `benchmarks/results/replanning.json`.
