@@ -6,6 +6,8 @@ CONFIG := configs/block_sorting_2d_2_blocks.json
 TASK := --env.task=BlockSorting2D-v0 --env.n_blocks=2 --env.waypoints_per_pose=1
 
 export TOKENIZERS_PARALLELISM = false
+# PyTorch's threads sleep while they wait for each other: on a CPU that others use, too, spinning is many times slower.
+export OMP_WAIT_POLICY ?= passive
 
 .PHONY: help setup quickstart test lint format clean
 
