@@ -36,7 +36,8 @@ Success in % of fresh starts (95 % interval), over the network calls for a plan.
 - `confidence` is DDIM for the motion, and symbols revealed as soon as the planner is sure of them.
 - *symbols lead* is the same with `symbol_lead=0.5`, the preset `default`: half of the calls reveal symbols beside a
   motion that is still pure noise, the other half denoise the motion. Without a lead, the motion may commit itself to a
-  plan of its own before the symbols have made up theirs. With a lead, it has half of the calls: in arranging, 5 are too few then.
+  plan of its own before the symbols have made up theirs. With a lead, it has half of the calls: in arranging, 5 are
+  too few then.
 
 Each section names the command that made it, as it was at that commit. Set `--policy.sampler`, `--policy.symbol_lead`
 and `--policy.num_inference_steps`.
