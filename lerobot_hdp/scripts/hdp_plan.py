@@ -16,14 +16,14 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-import torch
 from draccus.utils import ParsingError
 from httpx import HTTPError
 from lerobot import envs, policies  # noqa: F401 (registers LeRobot's own)
 from lerobot.configs import PolicyFeature, PreTrainedConfig, parser
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors, preprocess_observation
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
@@ -214,7 +214,8 @@ def explain(config: PlanConfig) -> str:
     if source is None:
         raise ValueError("the checkpoint names no dataset: choose one with --dataset.repo_id=... --dataset.root=...")
     try:
-        dataset = LeRobotDataset(source.repo_id, root=source.root, video_backend="pyav")
+        windows = resolve_delta_timestamps(policy.config, LeRobotDatasetMetadata(source.repo_id, root=source.root))
+        dataset = LeRobotDataset(source.repo_id, root=source.root, delta_timestamps=windows, video_backend="pyav")
     except (OSError, HTTPError) as error:
         raise ValueError(f"the dataset {source.repo_id} is not in {source.root}, nor to be had: {error}") from error
     for key, feature in {**policy.config.input_features, **policy.config.output_features}.items():
@@ -227,12 +228,8 @@ def explain(config: PlanConfig) -> str:
     first, stop = episode["dataset_from_index"], episode["dataset_to_index"]
     if stop - first > policy.config.horizon:
         raise ValueError(f"the episode has {stop - first} frames, the planner's horizon is {policy.config.horizon}")
-    frames = dataset.hf_dataset[first:stop]
-    item = {key: values[0] for key, values in frames.items()}
-    actions = torch.stack(list(frames["action"]))
-    actions = torch.cat([actions, actions[-1:].expand(policy.config.horizon - len(actions), -1)])
-    observed = {key: item[key][None] for key in policy.config.input_features}
-    batch = preprocessor({**observed, "action": actions[None]})
+    item = dataset[first]
+    batch = preprocessor({key: item[key][None] for key in (*policy.config.input_features, "action")})
     plan = policy.plan(batch, PlanPrompt(actions=batch["action"]))
     task = getattr(config.env, "planning_task", None)
     words = plan.describe(0, task.step_ends if task else None)
