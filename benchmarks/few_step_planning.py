@@ -25,22 +25,28 @@ FIRST_SEED = 2_000_000
 WAYS: dict[str, dict[str, Any]] = {
     "ddpm": {"sampler": "ddpm", "symbol_lead": 0.0},
     "ddim": {"sampler": "ddim", "symbol_lead": 0.0},
-    "confidence": {"sampler": "confidence", "symbol_lead": 0.0},
-    "symbols lead": {"sampler": "confidence", "symbol_lead": 0.5},
+    "confidence": {"sampler": "confidence", "symbol_lead": 0.0, "confidence_threshold": 0.95},
+    "confidence, 0.8": {"sampler": "confidence", "symbol_lead": 0.0, "confidence_threshold": 0.8},
+    "symbols lead": {"sampler": "confidence", "symbol_lead": 0.5, "confidence_threshold": 0.95},
+    "symbols lead, 0.8": {"sampler": "confidence", "symbol_lead": 0.5, "confidence_threshold": 0.8},
+    "symbols lead, 0.99": {"sampler": "confidence", "symbol_lead": 0.5, "confidence_threshold": 0.99},
 }
 PREAMBLE = """# Plans in few network calls
 
 Success in % of fresh starts (95 % interval), over the network calls for a plan.
 
 - `ddpm` is the paper's sampler, which uses 100 calls, and `ddim` draws the motion's noise at the start only.
-- `confidence` is DDIM for the motion, and symbols revealed as soon as the planner is sure of them.
+- `confidence` is DDIM for the motion, and symbols revealed as soon as the planner is sure of them: with
+  `confidence_threshold=0.95`, or what is named instead. The lower it is, the more symbols are drawn at once that know
+  nothing of each other. Where a planner has learned its plans, it is sure of nearly all of them and the threshold
+  makes no difference.
 - *symbols lead* is the same with `symbol_lead=0.5`, the preset `default`: half of the calls reveal symbols beside a
   motion that is still pure noise, the other half denoise the motion. Without a lead, the motion may commit itself to a
   plan of its own before the symbols have made up theirs. With a lead, it has half of the calls: in arranging, 5 are
   too few then.
 
-Each section names the command that made it, as it was at that commit. Set `--policy.sampler`, `--policy.symbol_lead`
-and `--policy.num_inference_steps`.
+Each section names the command that made it, as it was at that commit. Set `--policy.sampler`,
+`--policy.confidence_threshold`, `--policy.symbol_lead` and `--policy.num_inference_steps`.
 
 """
 
@@ -81,7 +87,7 @@ def _percent(point: dict[str, Any] | None) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path, help="a folder `pretrained_model` of a run with an environment")
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=["ddpm", "ddim", "confidence", "symbols lead"])
     parser.add_argument("--calls", nargs="+", type=int, default=[1, 2, 3, 4, 5, 7, 10, 20, 50, 100])
     parser.add_argument("--starts", type=int, default=200)
     options = parser.parse_args()

@@ -109,7 +109,8 @@ class HDPConfig(PreTrainedConfig):
         sampler: how a plan is drawn. `ddpm` is the paper's: noise in every step of the motion, symbols revealed at
             random. `ddim` draws the motion's noise at the start only. `confidence` does so too, and reveals symbols as
             soon as the planner is sure of them, which needs far fewer steps.
-        confidence_threshold: how probable a symbol must be for the `confidence` sampler to reveal it.
+        confidence_threshold: how probable a symbol must be for the `confidence` sampler to reveal it. What a step
+            reveals is drawn independently, so that a low threshold makes plans that contradict themselves.
         symbol_lead: share of the network calls in which the masked symbols are revealed beside a motion that is still
             pure noise. Without a lead, few steps let the motion choose a plan of its own before the symbols have made
             up theirs. There is none where a part of the motion is given, or all symbols of a whole batch.
@@ -167,7 +168,7 @@ class HDPConfig(PreTrainedConfig):
     ema_max_decay: float = 0.9999
 
     sampler: str | None = None
-    confidence_threshold: float = 0.8
+    confidence_threshold: float = 0.95
     symbol_lead: float | None = None
     num_inference_steps: int | None = None
     prompt: str | None = None
