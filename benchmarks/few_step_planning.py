@@ -45,8 +45,9 @@ Success in % of fresh starts (95 % interval), over the network calls for a plan.
   plan of its own before the symbols have made up theirs. With a lead, it has half of the calls: in arranging, 5 are
   too few then.
 
-Each section names the command that made it, as it was at that commit. Set `--policy.sampler`,
-`--policy.confidence_threshold`, `--policy.symbol_lead` and `--policy.num_inference_steps`.
+Each section names what made it, as the command was at that commit; of the checkpoints, those in `checkpoints/` were
+kept. Set `--policy.sampler`, `--policy.confidence_threshold`, `--policy.symbol_lead` and
+`--policy.num_inference_steps`.
 
 """
 

@@ -14,7 +14,6 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
-from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,6 +56,8 @@ EPISODES_PER_SHARD = 25
 """At most. A short recording has smaller shards, ..."""
 FEWEST_SHARDS = 8
 """... at least so many, so that all processes have work."""
+MOST_ATTEMPTS = 100
+"""Demonstrations of one episode that may fail."""
 
 
 @dataclass
@@ -164,10 +165,15 @@ def demonstrate(env: gym.Env, expert: Expert, seed: int, features_map: dict[str,
         seed: of the start, and of the expert's choices.
         features_map: what is recorded of an observation: its key in the environment (`pixels/front` is key `front` of
             the dictionary `pixels`) to the column.
+
+    Raises:
+        ValueError: the expert's waypoints are not as many as the task's horizon.
     """
     observation, _ = env.reset(seed=seed)
     demonstration = expert(env, expert_generator(seed))
     task: PlanningTask = env.unwrapped.planning_task  # type: ignore[attr-defined]
+    if len(demonstration.waypoints) != task.horizon:
+        raise ValueError(f"the expert has {len(demonstration.waypoints)} waypoints, {task.gym_id} {task.horizon}")
     frames = []
     for frame, action in enumerate(demonstration.waypoints):
         next_observation, score, terminated, truncated, info = env.step(action)
@@ -230,16 +236,25 @@ def dataset_features(config: RecordConfig) -> dict[str, dict[str, Any]]:
 
 
 def attempt_episodes(config: RecordConfig, episodes: range) -> Iterator[tuple[int, int, Episode]]:
-    """For each episode, by its index, attempts 0, 1, ... until one succeeds."""
+    """For each episode, by its index, attempts 0, 1, ... until one succeeds.
+
+    Raises:
+        ValueError: none does.
+    """
     env = gym.make(config.env.gym_id, disable_env_checker=True, **config.env.gym_kwargs)
     expert = EXPERTS[config.env.gym_id]
     try:
         for index in episodes:
-            for attempt in count():
+            for attempt in range(MOST_ATTEMPTS):
                 episode = demonstrate(env, expert, episode_seed(config.seed, index, attempt), config.env.features_map)
                 yield index, attempt, episode
                 if episode.succeeded:
                     break
+            else:
+                raise ValueError(
+                    f"the expert has failed {MOST_ATTEMPTS} times in a row (score {episode.columns[REWARD][-1, 0]:.2f} "
+                    f"in the end) and does not solve {config.env.gym_id}"
+                )
     finally:
         env.close()
 
@@ -446,18 +461,11 @@ def try_environment(config: RecordConfig) -> None:
     """Find out whether episodes can start, before there is anything on disk.
 
     Raises:
-        ValueError: they cannot.
+        OSError: images are wanted, and there is nothing to render with.
     """
-    import mujoco  # after gym_hdp_tasks, which says how to render without a display
-
     env = gym.make(config.env.gym_id, disable_env_checker=True, **config.env.gym_kwargs)
     try:
         env.reset(seed=0)
-    except mujoco.FatalError as error:
-        raise ValueError(
-            "cannot render images; without a display, MuJoCo needs EGL (Debian, Ubuntu: libegl1) and MUJOCO_GL=egl "
-            f"({error})"
-        ) from error
     finally:
         env.close()
 

@@ -181,7 +181,11 @@ class XArmEnv(gym.Env):
         return self._observation(), reward, False, truncated, self._info(clipped)
 
     def render(self) -> np.ndarray:
-        """The scene from the camera `front`: (480, 640, 3) uint8."""
+        """The scene from the camera `front`: (480, 640, 3) uint8.
+
+        Raises:
+            OSError: there is nothing to render with.
+        """
         return self._image(FRONT_CAMERA, RENDER_HEIGHT, RENDER_WIDTH, shadows=True)
 
     def close(self) -> None:
@@ -264,7 +268,13 @@ class XArmEnv(gym.Env):
 
     def _image(self, camera: str, height: int, width: int, shadows: bool) -> np.ndarray:
         if (height, width) not in self._renderers:
-            self._renderers[height, width] = mujoco.Renderer(self.model, height, width)
+            try:
+                self._renderers[height, width] = mujoco.Renderer(self.model, height, width)
+            except (mujoco.FatalError, ImportError) as error:
+                raise OSError(
+                    "cannot render images; without a display, MuJoCo needs EGL (Debian, Ubuntu: libegl1) and "
+                    f"MUJOCO_GL=egl ({error})"
+                ) from error
         renderer = self._renderers[height, width]
         renderer.update_scene(self.data, camera)
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows

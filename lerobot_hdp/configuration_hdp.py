@@ -125,7 +125,7 @@ class HDPConfig(PreTrainedConfig):
             `adamw` all by AdamW.
         optimizer_*, scheduler_*: of these, with a linear warm-up and a cosine decay to the last step. The preset's
             learning rate is one for the network that is the default; smaller ones, as in `configs/`, learn faster with
-            3e-3, which is too much for it (docs/tasks/xarm_arrange_blocks.md).
+            3e-3, which was too much for it in arranging (docs/tasks/xarm_arrange_blocks.md).
             `optimizer_betas`, `optimizer_eps`: of AdamW; `optimizer_momentum`: of Muon; `optimizer_fused`: AdamW
             updates all parameters in one kernel; None: on CUDA.
 
@@ -222,8 +222,8 @@ class HDPConfig(PreTrainedConfig):
                 raise ParsingError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 <= self.symbol_lead < 1:
             raise ParsingError(f"symbol_lead must be at least 0 and less than 1, got {self.symbol_lead}")
-        if self.lead_share and self.symbol_process is None:
-            raise ParsingError("lead_share is about symbols, which this planner does not model: leave it at 0")
+        if self.lead_share and self.symbol_process != "masked":
+            raise ParsingError("lead_share is about masked symbols, which this planner does not have: leave it at 0")
         if self.width % self.num_heads or self.width % 2:
             raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
         if self.rotary and self.width // self.num_heads % 2:

@@ -199,7 +199,7 @@ class HDPPolicy(PreTrainedPolicy):
     def _loss(
         self, batch: dict[str, Tensor], network: Planner, generator: Generator | None
     ) -> tuple[Tensor, dict[str, float]]:
-        motion = batch[ACTION]
+        motion = self._motion(batch)
         levels = self._sample_levels(self.motion_process, len(motion), generator)
         levels = levels.masked_fill(self._symbols_lead(levels, generator), 1.0)
         noisy_motion = self._corrupt(self.motion_process, motion, levels, generator)
@@ -219,6 +219,10 @@ class HDPPolicy(PreTrainedPolicy):
         symbol_loss = self.symbol_process.loss(prediction.symbols, corrupted_symbols).mean()
         loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
         return loss, read_losses(motion_loss=motion_loss, symbol_loss=symbol_loss)
+
+    def _motion(self, batch: dict[str, Tensor]) -> Tensor:
+        """The actions, (B, H, D); LeRobot's are (B, H) where D is 1."""
+        return batch[ACTION].reshape(len(batch[ACTION]), -1, *self.config.action_feature.shape)
 
     def _symbols_lead(self, levels: Tensor, generator: Generator | None) -> Tensor:
         """In which samples the motion is pure noise, as in planning while the symbols lead: like levels, bool."""

@@ -1,7 +1,7 @@
 """Dataset or environment batch <-> what the planner sees."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,38 @@ from .vocabulary import FREE, FREE_SYMBOL, PAD_ID
 
 NARROWEST_RANGE = 0.1
 """What `widen_narrow_ranges` leaves of the widest range."""
+
+
+@ProcessorStepRegistry.register(name="hdp_observation_shapes")
+@dataclass
+class ObservationShapesProcessorStep(ObservationProcessorStep):
+    """Refuse observations that are not those that the planner was trained on.
+
+    Attributes:
+        shapes: of each observation. LeRobot stores what has one component as a number, of which nothing is said here.
+
+    Raises:
+        ValueError: an observation is missing or has another shape.
+    """
+
+    shapes: dict[str, list[int]] = field(default_factory=dict)
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        for key, shape in self.shapes.items():
+            if key not in observation:
+                raise ValueError(f"the planner was trained on {key}, which is not observed here")
+            found = list(observation[key].shape[-len(shape) :])
+            if shape != [1] and found != shape:
+                raise ValueError(f"the planner was trained on {key} of shape {shape}, here it has {found}")
+        return observation
+
+    def get_config(self) -> dict[str, Any]:
+        return {"shapes": self.shapes}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
 
 
 @ProcessorStepRegistry.register(name="hdp_symbolic_plan")
@@ -77,16 +109,17 @@ def make_hdp_pre_post_processors(
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """LeRobot's default processors, and the symbolic plan as token ids."""
+    """LeRobot's default processors, after a look at the observations, and the symbolic plan as token ids."""
     widen_narrow_ranges(config, dataset_stats or {})
     steps = make_default_policy_processor_steps(config, dataset_stats)
+    shapes = ObservationShapesProcessorStep({key: list(value.shape) for key, value in config.input_features.items()})
     symbolic_plan = SymbolicPlanProcessorStep(
         symbolic_horizon=config.symbolic_horizon if config.symbol_process else None,
         vocabulary_size=len(config.vocabulary or []),
     )
     return make_policy_processor_pipelines(
         input_steps=[
-            steps.rename_observations, steps.add_batch_dim, symbolic_plan, steps.to_device, steps.normalize
+            steps.rename_observations, steps.add_batch_dim, shapes, symbolic_plan, steps.to_device, steps.normalize
         ],
         output_steps=[steps.unnormalize, steps.to_cpu],
     )  # fmt: skip

@@ -4,6 +4,7 @@ import json
 import shutil
 import warnings
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -11,7 +12,9 @@ from draccus.utils import ParsingError
 from huggingface_hub import ModelCard
 from lerobot.configs import DatasetConfig, FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.policies import make_pre_post_processors
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_eval, lerobot_train
 from safetensors.torch import load_file
@@ -53,6 +56,44 @@ class HostReads(TorchDispatchMode):
         if waits:
             self.found.append(str(func))
         return func(*args, **kwargs or {})
+
+
+@pytest.fixture(scope="module")
+def one_component_each(tmp_path_factory):
+    """An observation and an action of one component, which LeRobot stores as a number."""
+    numbers = {"dtype": "float32", "names": None}
+    plan = {"dtype": "int64", "shape": (2,), "names": None, "info": {"vocabulary": ["PAD", "OPEN", "CLOSE"]}}
+    features = {
+        "observation.state": {**numbers, "shape": (3,)},
+        "observation.gripper": {**numbers, "shape": (1,)},
+        "observation.symbolic_plan": plan,
+        "action": {**numbers, "shape": (1,)},
+    }
+    root = tmp_path_factory.mktemp("one_component") / "dataset"
+    dataset = LeRobotDataset.create("test/gripper", fps=5, features=features, root=root)
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        for _ in range(5):
+            frame = {key: rng.random(features[key]["shape"], np.float32) for key in features if "plan" not in key}
+            dataset.add_frame({**frame, "observation.symbolic_plan": np.array([1, 2]), "task": "open and close"})
+        dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDataset("test/gripper", root=root)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_observations_and_actions_of_one_component(one_component_each, planner):
+    config_class = PreTrainedConfig.get_choice_class(planner)
+    config = config_class(**{**TINY_PLANNER, "horizon": 5, "device": "cpu", "push_to_hub": False})
+    policy = make_policy(config, ds_meta=one_component_each.meta)
+    preprocessor, postprocessor = make_pre_post_processors(config, dataset_stats=one_component_each.meta.stats)
+    windows = resolve_delta_timestamps(config, one_component_each.meta)
+    windowed = LeRobotDataset("test/gripper", root=one_component_each.root, delta_timestamps=windows)
+    batch = preprocessor(torch.utils.data.default_collate([windowed[episode * 5] for episode in range(4)]))
+    policy.train().forward(batch)[0].backward()
+    now = {"observation.state": torch.rand(2, 3), "observation.gripper": torch.rand(2, 1)}
+    plan = policy.eval().plan(preprocessor(now))
+    assert postprocessor(plan.actions).shape == (2, 5, 1)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)

@@ -151,10 +151,11 @@ def test_a_budget_ends_with_a_checkpoint_or_before_the_beginning(cell, capsys, m
     assert 0 < long.last_step < long.steps
 
 
-def test_a_finished_cell_is_not_run_again_and_must_be_what_it_says(finished):
+def test_a_finished_cell_is_not_run_again_and_must_be_what_it_says(finished, capsys):
     before = finished.result_file.read_text()
     run_cells([finished])
     assert finished.result_file.read_text() == before
+    assert "1 of 1 are finished; to run one again, delete its file" in capsys.readouterr().out
     with pytest.raises(ValueError, match="was made with steps=300, not 400"):
         cells.read_result(replace(finished, steps=400))
     finished.result_file.unlink()
@@ -204,9 +205,9 @@ def test_an_exported_planner_makes_the_same_plans(finished, tmp_path):
 
 
 def write_result(cell: Cell, scores: list[float], failures: int) -> None:
-    """A results file with known figures."""
+    """A results file with known figures: success is half the score."""
     outcome = {"valid_plans": 98, "failures": failures, "failures_with_valid_plan": min(failures, 1)}
-    points = [{"step": i, "success_rate": score, "mean_score": score, **outcome} for i, score in enumerate(scores)]
+    points = [{"step": i, "success_rate": score / 2, "mean_score": score, **outcome} for i, score in enumerate(scores)]
     facts = {"planner": cell.policy["type"], "train_s": 90.0, "samples_per_second": 7.0, "curve": points}
     result = {**cell.settings, **facts}
     run = {"gpu": None, "cpu": "Abacus", "cores": 2, "git_commit": "abc"}
@@ -226,9 +227,9 @@ def test_the_report_has_what_was_run_and_says_what_is_missing(tmp_path, monkeypa
     assert all(path.exists() for path in plots)
     text = page.read_text()
     # Means of the seeds 90, 90, 100: 93.3 +- 4.303 * 5.77 / sqrt(3); standard deviation of all evaluations 7.1.
-    assert "| HDP | 86 % (5 %) | 93 % (7 %), 3 seeds: 79 to 100 | 74 % (10 %) | missing |" in text
-    assert "| Diffuser | 46 % (6 %) | 20 % (35 %), one seed |" in text
-    assert "| Joint Diffuser | 42 % (5 %) | 45 % (5 %), seeds: 40, 50 |" in text
+    assert "| HDP | 86 % (5 %) | 93 % (7 %), 3 seeds: 79 to 100; success 47 % | 74 % (10 %) | missing |" in text
+    assert "| Diffuser | 46 % (6 %) | 20 % (35 %), one seed; success 10 % |" in text
+    assert "| Joint Diffuser | 42 % (5 %) | 45 % (5 %), seeds: 40, 50; success 22 % |" in text
     assert "| xarm_sorting, mini | 900 | 9 | 6 | 3 |" in text
     assert "| xarm_sorting, mini | 1.5 min, 7/s | 1.5 min, 7/s | 1.5 min, 7/s | missing |" in text
     assert "6 of 108 with `--preset mini`" in text

@@ -264,6 +264,17 @@ def test_hdp_plan_explains_a_dataset_without_symbols_and_without_a_task(checkpoi
     assert capsys.readouterr().out.endswith("the dataset has no symbolic plans\n")
 
 
+def test_hdp_plan_takes_a_planner_without_its_training_configuration(checkpoint, tmp_path, capsys):
+    """As `policy.push_to_hub` uploads it."""
+    policy = tmp_path / "policy"
+    shutil.copytree(checkpoint, policy, ignore=shutil.ignore_patterns("train_config.json"))
+    flags = [f"--policy.path={policy}", f"--output_dir={tmp_path / 'plan'}"]
+    with pytest.raises(SystemExit, match="names no simulated task: choose one with --env"):
+        call_command(hdp_plan.main, *flags)
+    call_command(hdp_plan.main, *flags, "--env.type=hdp", *TASK_FLAGS)
+    assert "plan:" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [

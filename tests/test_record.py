@@ -341,6 +341,29 @@ def test_failed_demonstrations_are_dropped_and_counted(tmp_path, monkeypatch, ca
 
 
 @pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda waypoints: np.zeros_like(waypoints), "failed 100 times in a row"),
+        (lambda waypoints: waypoints[:-1], f"{HORIZON - 1} waypoints, hdp/BlockSorting2D-v0 {HORIZON}"),
+    ],
+)
+def test_an_expert_that_does_not_solve_the_task_is_an_error(tmp_path, monkeypatch, change, message):
+    expert = EXPERTS["hdp/BlockSorting2D-v0"]
+
+    def useless(env, rng):
+        demonstration = expert(env, rng)
+        return replace(demonstration, waypoints=change(demonstration.waypoints))
+
+    monkeypatch.setitem(EXPERTS, "hdp/BlockSorting2D-v0", useless)
+    config = RecordConfig(
+        dataset=RecordDatasetConfig(repo_id="test/useless", root=tmp_path / "useless", num_episodes=2),
+        env=HDPEnv(n_blocks=2, waypoints_per_pose=1),
+    )
+    with pytest.raises(ValueError, match=message):
+        record(config)
+
+
+@pytest.mark.parametrize(
     ("flag", "message"),
     [
         ("--env.task=Juggling-v0", "is not a task of --env.type=hdp"),

@@ -75,11 +75,18 @@ ctypes.CDLL.__init__ = load_unless_egl
 import gymnasium as gym
 import gym_hdp_tasks
 
-gym.make("hdp/XArmSorting-v0").reset(seed=0)
+env = gym.make("hdp/XArmSorting-v0", render_mode="rgb_array")
+env.reset(seed=0)
+try:
+    env.render()
+except OSError as error:
+    assert "libegl1" in str(error), error
+else:
+    raise AssertionError("rendered without EGL")
 """
 
 
-def test_states_need_no_egl():
+def test_without_egl_there_are_states_and_one_clear_error_instead_of_images():
     """As in a slim container: no display, and no libEGL to be found."""
     unset = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
     environment = {name: value for name, value in os.environ.items() if name not in unset}

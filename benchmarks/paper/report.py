@@ -66,8 +66,8 @@ def write_report(page: Path = DOCS / "results.md") -> list[Path]:
         "## The simulation table\n",
         "The mean score and, in parentheses, its standard deviation over seeds and over the checkpoints at the end of "
         "training, as the paper gives them; then the means of the seeds, or from three on the 95 % interval of the "
-        "mean over trainings (Student's t). The tasks are built after the paper's description, in our own simulation: "
-        "its figures stand beside ours for orientation.\n",
+        "mean over trainings (Student's t); last, how often the whole task was solved. The tasks are built after the "
+        "paper's description, in our own simulation: its figures stand beside ours for orientation.\n",
         *(simulation(preset, XARM_TASKS, results) for preset in ("default", "small", "small_adamw", "mini", "paper")),
         "## The number of blocks\n",
         "2D sorting, with one waypoint a pose (19, 37 and 55 actions; the paper has longer ones). The paper shows this "
@@ -127,19 +127,21 @@ def last_points(contents: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def score(contents: Sequence[dict[str, Any]] | None) -> str:
-    """Mean score in %, its standard deviation, and of several seeds their means or the interval of the mean."""
+    """Mean score in %, its standard deviation, of several seeds their means or the interval of the mean; success."""
     if not contents:
         return MISSING
-    scores = [100 * point["mean_score"] for point in last_points(contents)]
-    text = f"{mean(scores):.0f} % ({stdev(scores):.0f} %)"
-    if len(contents) == 1:
-        return f"{text}, one seed"
+    points = last_points(contents)
+    scores = [100 * point["mean_score"] for point in points]
     of_seeds = [mean(100 * point["mean_score"] for point in last_points([content])) for content in contents]
-    if len(of_seeds) < FEWEST_FOR_AN_INTERVAL:
-        return f"{text}, seeds: {', '.join(f'{seed:.0f}' for seed in of_seeds)}"
-    half = T_95[len(of_seeds) - 2] * stdev(of_seeds) / math.sqrt(len(of_seeds))
-    low, high = max(0, mean(of_seeds) - half), min(100, mean(of_seeds) + half)
-    return f"{text}, {len(of_seeds)} seeds: {low:.0f} to {high:.0f}"
+    seeds = f"seeds: {', '.join(f'{seed:.0f}' for seed in of_seeds)}"
+    if len(of_seeds) == 1:
+        seeds = "one seed"
+    elif len(of_seeds) >= FEWEST_FOR_AN_INTERVAL:
+        half = T_95[len(of_seeds) - 2] * stdev(of_seeds) / math.sqrt(len(of_seeds))
+        low, high = max(0, mean(of_seeds) - half), min(100, mean(of_seeds) + half)
+        seeds = f"{len(of_seeds)} seeds: {low:.0f} to {high:.0f}"
+    success = 100 * mean(point["success_rate"] for point in points)
+    return f"{mean(scores):.0f} % ({stdev(scores):.0f} %), {seeds}; success {success:.0f} %"
 
 
 def plot_training(results: Results, path: Path) -> None:

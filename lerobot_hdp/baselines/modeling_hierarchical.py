@@ -4,11 +4,11 @@ Shapes: B samples, M segments of K actions of size D, sub-goals of size S. A sub
 vector.
 """
 
+import math
 from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
-from lerobot.utils.constants import ACTION
 from torch import Generator, Tensor, nn
 
 from ..denoiser import Denoiser, Prediction
@@ -101,8 +101,8 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
 
     def _states(self, batch: dict[str, Tensor]) -> Tensor:
         """What is observed now and, in training, the sub-goals: (B, 1 or 1 + M, S)."""
-        observations = [batch[key] for key in self.config.input_features]
-        return torch.cat([value if value.ndim == 3 else value[:, None] for value in observations], dim=-1)
+        sizes = {key: math.prod(feature.shape) for key, feature in self.config.input_features.items()}
+        return torch.cat([batch[key].reshape(len(batch[key]), -1, size) for key, size in sizes.items()], dim=-1)
 
     def _to_segments(self, motion: Tensor) -> Tensor:
         """(B, M K, ...) -> (B M, K, ...)."""
@@ -126,7 +126,7 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
     ) -> tuple[Tensor, dict[str, float]]:
         """Each level's squared error; the low level is trained on the demonstration's own sub-goals."""
         process = self.motion_process
-        states, segments = self._states(batch), self._to_segments(batch[ACTION])
+        states, segments = self._states(batch), self._to_segments(self._motion(batch))
         state, subgoals = states[:, 0], states[:, 1:]
 
         noisy_subgoals = self._corrupt(
@@ -193,7 +193,7 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
     ) -> tuple[Tensor, dict[str, float]]:
         """Each level's squared error, at the same step k, each conditioned on the other as in planning."""
         process = self.motion_process
-        states, segments = self._states(batch), self._to_segments(batch[ACTION])
+        states, segments = self._states(batch), self._to_segments(self._motion(batch))
         state, subgoals = states[:, 0], states[:, 1:]
         levels = self._sample_levels(process, len(state), generator)
         noisy_subgoals = self._corrupt(process, subgoals, levels, generator)

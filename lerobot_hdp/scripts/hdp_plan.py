@@ -21,7 +21,7 @@ from httpx import HTTPError
 from lerobot import envs, policies  # noqa: F401 (registers LeRobot's own)
 from lerobot.configs import PolicyFeature, PreTrainedConfig, parser
 from lerobot.configs.default import DatasetConfig
-from lerobot.configs.train import TrainPipelineConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors, preprocess_observation
@@ -78,9 +78,9 @@ class PlanConfig:
         overrides = parser.get_cli_overrides("policy") or []
         self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         self.policy.pretrained_path = Path(path)
-        trained = TrainPipelineConfig.from_pretrained(path)
-        self.env = self.env or trained.env
-        self.dataset = self.dataset or trained.dataset
+        if trained := _train_config(path, self.policy.pretrained_revision):
+            self.env = self.env or trained.env
+            self.dataset = self.dataset or trained.dataset
         if self.explain is None and self.env is None:
             raise ValueError(
                 "the checkpoint names no simulated task: choose one with --env.type=hdp --env.task=...; without one, "
@@ -251,9 +251,20 @@ def _load(config: PlanConfig) -> tuple[HDPPolicy, PolicyProcessorPipeline, Polic
     policy_class = get_policy_class(config.policy.type)
     if not issubclass(policy_class, HDPPolicy):
         raise ValueError(f"hdp-plan draws the plans of `hdp` policies, not of `{config.policy.type}`")
-    policy = policy_class.from_pretrained(path, config=config.policy).eval()
+    revision = config.policy.pretrained_revision
+    policy = policy_class.from_pretrained(path, config=config.policy, revision=revision).eval()
     device = {"device_processor": {"device": policy.config.device}}
-    return policy, *make_pre_post_processors(config.policy, path, preprocessor_overrides=device)
+    return policy, *make_pre_post_processors(config.policy, path, revision, preprocessor_overrides=device)
+
+
+def _train_config(path: str, revision: str | None) -> TrainPipelineConfig | None:
+    """What the planner was trained with; None for one that was saved or uploaded without it."""
+    if Path(path).is_dir() and not (Path(path) / TRAIN_CONFIG_NAME).exists():
+        return None
+    try:
+        return TrainPipelineConfig.from_pretrained(path, revision=revision)
+    except FileNotFoundError:
+        return None
 
 
 def _check_task(planner: HDPConfig, task: Any) -> None:
@@ -344,7 +355,7 @@ def main() -> None:
         _main()
     except ParsingError as error:  # draccus wraps what happens while a checkpoint's configuration is read
         sys.exit(f"hdp-plan: {error.__cause__ or error}")
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         sys.exit(f"hdp-plan: {error}")
 
 
