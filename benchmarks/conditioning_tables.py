@@ -87,8 +87,8 @@ def write_page() -> None:
     before = PAGE.read_text().split(HEADING)[0]
     note = (
         "95 % intervals are Wilson's; the same starts in every column of a table, one training of each planner. The "
-        "checkpoints are those of `python -m benchmarks.paper --preset mini` (in the middle of learning, see "
-        "[results](results.md)).\n"
+        "checkpoints are those of `python -m benchmarks.paper` with the preset that each command names: `small`, or "
+        "`mini`, an earlier one in the middle of learning ([results](results.md)).\n"
     )
     PAGE.write_text("\n".join([before + HEADING, note, *(table(*arguments) for arguments in TABLES)]))
 

@@ -33,7 +33,7 @@ TITLES = {
     "mini_epsilon": "The same, predicting the noise, as the paper does",
 }
 MISSING = "missing"
-OF_MINI = "Planners of the preset `mini`, 200 starts. [More](conditioning.md#measured)"
+OF_SMALL = "Planners of the preset `small`, 200 starts. [More](conditioning.md#measured)"
 FEWEST_FOR_AN_INTERVAL = 3
 """Trainings. Of two, Student's t makes an interval of width 0, if they happen to agree, or one that says nothing."""
 T_95 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
@@ -195,7 +195,7 @@ def valid_plan() -> str:
         cells = [percent(result[name]["success"]) for name in names] if result else [MISSING, MISSING]
         rows.append([f"{blocks} blocks", *cells, f"{result['train_steps']:,}" if result else ""])
     header = ["HDP, success", "a valid plan given", "nothing given", "steps of training"]
-    return f"{markdown_table(header, rows)}\n{OF_MINI}\n"
+    return f"{markdown_table(header, rows)}\n{OF_SMALL}\n"
 
 
 def adherence() -> str:
@@ -220,7 +220,7 @@ def adherence() -> str:
         "without it",
     ]
     note = "In the paper, without the prompt, it is 30 to 35 % for all."
-    return f"{markdown_table(header, rows)}\n{note} {OF_MINI}\n"
+    return f"{markdown_table(header, rows)}\n{note} {OF_SMALL}\n"
 
 
 def latency() -> str:
