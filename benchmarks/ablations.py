@@ -33,12 +33,6 @@ TASKS = {
 SEEDS = (0, 1)
 NOISE = {"prediction_type": "epsilon", "optimizer_lr": 5e-4}
 """Noise prediction, at the learning rate of the preset `mini_epsilon`."""
-OF_THE_PAPERS_TABLES = {
-    "rotary=false": "mini",
-    "prediction_type=epsilon, symbol_loss_weight=1/30": "mini_epsilon",
-    "unchanged": "small",
-}
-"""Variants that are cells of `benchmarks.paper` already, and of which preset."""
 CHANGES: dict[str, dict[str, Any]] = {
     "prediction_type=epsilon": NOISE,
     "prediction_type=v_prediction": {"prediction_type": "v_prediction"},
@@ -80,10 +74,17 @@ CHANGES: dict[str, dict[str, Any]] = {
     "type=separate_diffuser, symbol_loss_weight=3.2": {"type": "separate_diffuser", "symbol_loss_weight": 3.2},
 }
 """Of the planner of `mini`."""
-CHANGES_OF_SMALL: dict[str, dict[str, Any]] = {"lead_share=0": {"lead_share": 0.0}}
-OF_MINI = ("rotary=false", "prediction_type=epsilon, symbol_loss_weight=1/30", *CHANGES)
-OF_SMALL = ("unchanged", *CHANGES_OF_SMALL)
-VARIANTS = (*OF_MINI, *OF_SMALL)
+EARLIER: dict[str, tuple[str, dict[str, Any]]] = {
+    "rotary=false": ("mini", {}),
+    "prediction_type=epsilon, symbol_loss_weight=1/30": ("mini_epsilon", {}),
+    **{name: ("mini", changes) for name, changes in CHANGES.items()},
+}
+TODAYS: dict[str, tuple[str, dict[str, Any]]] = {
+    "unchanged": ("small", {}),
+    "lead_share=0": ("small", {"lead_share": 0.0}),
+}
+VARIANTS = {**EARLIER, **TODAYS}
+"""For each variant a preset of the paper's tables and what is changed of it; with no change, it is a cell of these."""
 WHAT_FOLLOWS = """
 The first row was the base when this table was begun. What has become the `default` preset since:
 
@@ -134,25 +135,21 @@ The planners of [`small`](results.md), and what one change makes of them. (`lead
 """
 
 
-def preset_of(name: str) -> str:
-    """The preset of the paper's tables that a variant belongs to, or changes."""
-    return OF_THE_PAPERS_TABLES.get(name, "small" if name in OF_SMALL else "mini")
-
-
 def variant_of(name: str, task: str, seed: int) -> Cell:
     """The cell of a variant, one of `TASKS` and a seed.
 
     Raises:
         KeyError: the variant's preset has no such task.
     """
-    cell = make_cell(preset_of(name), TASKS[task], "hdp", seed)
-    if name in OF_THE_PAPERS_TABLES:
+    preset, changes = VARIANTS[name]
+    cell = make_cell(preset, TASKS[task], "hdp", seed)
+    if not changes:
         return cell
     return replace(
         cell,
         group="ablations",
         name=f"{task}_{name.replace(', ', '_').replace('/', '_')}_seed{seed}",
-        policy=complete({**cell.policy, **{**CHANGES, **CHANGES_OF_SMALL}[name]}),
+        policy=complete({**cell.policy, **changes}),
         facts={"variant": name},
     )
 
@@ -161,10 +158,11 @@ def variants(names: Iterable[str], tasks: Iterable[str], seeds: Iterable[int]) -
     """The cells of these variants, tasks and seeds, of those tasks where the variant's preset has what is changed."""
     found = {}
     for name, task, seed in product(names, tasks, seeds):
-        if TASKS[task] not in PRESETS[preset_of(name)].tasks:
+        preset, changes = VARIANTS[name]
+        if TASKS[task] not in PRESETS[preset].tasks:
             continue
-        cell, base = variant_of(name, task, seed), make_cell(preset_of(name), TASKS[task], "hdp", seed)
-        if name in OF_THE_PAPERS_TABLES or _config(cell) != _config(base):
+        cell = variant_of(name, task, seed)
+        if not changes or _config(cell) != _config(make_cell(preset, TASKS[task], "hdp", seed)):
             found[name, task, seed] = cell
     return found
 
@@ -183,8 +181,9 @@ def write_page() -> None:
             rates = [point["success_rate"] for point in points_that_count(content["result"])]
             scores[variant, task].append(100 * mean(rates))
 
-    def table(names: tuple[str, ...]) -> str:
-        bases = [cells[names[0], task, SEEDS[0]] for task in TASKS]
+    def table(names: Iterable[str]) -> str:
+        first, *_ = names
+        bases = [cells[first, task, SEEDS[0]] for task in TASKS]
         rows = [
             [f"`{name}`", *(_each(scores[name, task]) for task in TASKS)]
             for name in names
@@ -196,14 +195,14 @@ def write_page() -> None:
         return f"{budget}\n{markdown_table(['setting', *TASKS.values()], rows)}"
 
     spread = max(max(seeds) - min(seeds) for seeds in scores.values() if seeds)
-    base = cells[VARIANTS[0], "3_blocks", SEEDS[0]]
+    base = cells["rotary=false", "3_blocks", SEEDS[0]]
     PAGE.write_text(
         "# What helps HDP to learn\n\n"
         f"Success in % in the middle of learning; for each seed, the mean over the last {base.average_last} "
         f"evaluations of {base.starts} fresh starts, whose 95 % interval reaches about 5 points to each side; "
         f"two seeds of one setting differ by up to {spread:.0f} points. The "
         "first row has learned positions alone and AdamW; in the others, what is named is changed. "
-        "`python -m benchmarks.ablations`\n\n" + table(OF_MINI) + WHAT_FOLLOWS + table(OF_SMALL)
+        "`python -m benchmarks.ablations`\n\n" + table(EARLIER) + WHAT_FOLLOWS + table(TODAYS)
     )
 
 
@@ -220,7 +219,7 @@ def _budget(cell: Cell) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", default=tuple(TASKS), choices=tuple(TASKS))
-    parser.add_argument("--variants", nargs="+", default=VARIANTS, choices=VARIANTS)
+    parser.add_argument("--variants", nargs="+", default=tuple(VARIANTS), choices=tuple(VARIANTS))
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS, choices=SEEDS)
     parser.add_argument("--processes", type=int, default=1, help="cells at a time, which share the cores")
     parser.add_argument("--list", action="store_true")
