@@ -104,7 +104,8 @@ class Cell:
     @property
     def dataset_root(self) -> Path:
         task, *parameters = self.env.items()
-        parts = [task[1].removesuffix("-v0"), *(f"{name}_{value}" for name, value in parameters)]
+        values = [(name, "_".join(value) if isinstance(value, list) else value) for name, value in parameters]
+        parts = [task[1].removesuffix("-v0"), *(f"{name}_{value}" for name, value in values)]
         return DATASETS / "_".join([*parts, f"{self.demonstrations}_episodes"])
 
     @property

@@ -4,15 +4,17 @@ import json
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.vector.utils import concatenate, create_empty_array
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.envs import preprocess_observation
 from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 
 import lerobot_policy_hdp  # noqa: F401 (registers the policies and the tasks)
@@ -111,14 +113,18 @@ def load(path: Path, starts: int, gym_id: str | None = None, first_seed: int = 0
         options: see `load_policy`.
     """
     policy, preprocessor, postprocessor = load_policy(path, **options)
-    task = TrainPipelineConfig.from_pretrained(path).env.planning_task
+    env_config = TrainPipelineConfig.from_pretrained(path).env
+    task = env_config.planning_task
     gym_id = gym_id or task.gym_id
-    env = gym.make(gym_id, disable_env_checker=True, **task.parameters)
+    if env_config.obs_type == "pixels":
+        env_config = replace(env_config, obs_type="pixels_state")  # the checker looks at the objects' poses
+    env = gym.make(gym_id, disable_env_checker=True, **env_config.gym_kwargs)
     seeds = range(first_seed, first_seed + starts)
     observations = [env.reset(seed=seed)[0] for seed in seeds]
-    names = {"observation.state": "agent_pos", "observation.environment_state": "environment_state"}
-    stacked = {key: torch.tensor(np.stack([o[name] for o in observations])) for key, name in names.items()}
-    inputs = {key: value for key, value in preprocessor(stacked).items() if key in names}
+    space = env.observation_space
+    stacked = preprocess_observation(concatenate(space, observations, create_empty_array(space, starts)))
+    env.close()
+    inputs = {key: value for key, value in preprocessor(stacked).items() if key in policy.config.input_features}
     return Subject(path, policy, postprocessor, gym_id, task.parameters, seeds, observations, inputs)
 
 

@@ -25,7 +25,7 @@ TASKS: dict[str, Callable[..., PlanningTask]] = {
 }
 """Task name, as in `--env.task=`, to the function that states the task's facts."""
 BLOCK_SORTING_2D_ONLY = ("n_blocks", "waypoints_per_pose")
-XARM_ONLY = ("robot", "obs_type", "camera_height", "camera_width")
+XARM_ONLY = ("robot", "obs_type", "camera_names", "camera_height", "camera_width")
 """Fields of `HDPEnv` that not every task has."""
 
 
@@ -41,6 +41,7 @@ class HDPEnv(EnvConfig):
             (BlockSorting2D only).
         robot: `primitive`, or `menagerie` for MuJoCo Menagerie's model (X-Arm tasks only).
         obs_type: `state`, `pixels` or `pixels_state` (X-Arm tasks only).
+        camera_names: the cameras to observe, of `front` and `wrist` (X-Arm tasks only).
         camera_height: of an observed image, in pixels (X-Arm tasks only).
         camera_width: likewise.
         fps: actions per second, which the task decides.
@@ -54,6 +55,7 @@ class HDPEnv(EnvConfig):
     waypoints_per_pose: int = 3
     robot: str = "primitive"
     obs_type: str = "state"
+    camera_names: tuple[str, ...] = CAMERAS
     camera_height: int = 128
     camera_width: int = 128
     fps: int = EnvConfig.fps
@@ -66,6 +68,8 @@ class HDPEnv(EnvConfig):
             raise ParsingError(str(error)) from error
         if self.obs_type not in OBS_TYPES:
             raise ParsingError(f"--env.obs_type must be one of {OBS_TYPES}, got {self.obs_type!r}")
+        if not self.camera_names or not set(self.camera_names) <= set(CAMERAS):
+            raise ParsingError(f"--env.camera_names must be some of {CAMERAS}, got {self.camera_names}")
         others = BLOCK_SORTING_2D_ONLY if self._is_xarm else XARM_ONLY
         for field in fields(self):
             if field.name in others and getattr(self, field.name) != field.default:
@@ -82,8 +86,8 @@ class HDPEnv(EnvConfig):
             self.features_map |= {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
         if self.obs_type != "state":
             image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.camera_height, self.camera_width, 3))
-            self.features |= {f"pixels/{camera}": image for camera in CAMERAS}
-            self.features_map |= {f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in CAMERAS}
+            self.features |= {f"pixels/{camera}": image for camera in self.camera_names}
+            self.features_map |= {f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in self.camera_names}
 
     @property
     def planning_task(self) -> PlanningTask:
@@ -120,6 +124,7 @@ class HDPEnv(EnvConfig):
         if self._is_xarm:
             kwargs |= {
                 "obs_type": self.obs_type,
+                "camera_names": self.camera_names,
                 "camera_height": self.camera_height,
                 "camera_width": self.camera_width,
             }

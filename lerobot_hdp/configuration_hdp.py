@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -11,7 +11,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
 
-from .encoders import object_sizes
+from .encoders import image_feature_size, object_sizes
 from .optimizer import OPTIMIZERS, FusedAdamWConfig, MuonAdamWConfig
 from .processes.gaussian import PREDICTION_TYPES
 from .processes.masked import MASK_SCHEDULES
@@ -22,10 +22,13 @@ OBS_SYMBOLIC_PLAN = f"{OBS_PREFIX}symbolic_plan"
 """Dataset column with the plan's token ids; from an environment, the plan's prompt. It has this name because LeRobot
 keeps only `observation.*` columns."""
 
+VISION_BACKBONES = ["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
+BACKBONE_STRIDE = 32
+"""Pixels from one cell of its feature maps to the next."""
 SAMPLERS = ["ddpm", "ddim", "confidence"]
 
 AT_LEAST_1 = ["num_layers", "num_heads", "width", "num_train_timesteps", "horizon", "symbolic_horizon"]
-AT_LEAST_1 += ["n_action_steps", "num_inference_steps", "num_candidates"]
+AT_LEAST_1 += ["n_action_steps", "num_inference_steps", "num_candidates", "spatial_softmax_num_keypoints"]
 
 PRESETS: dict[str, dict[str, Any]] = {
     # What measures best.
@@ -87,11 +90,16 @@ class HDPConfig(PreTrainedConfig):
         rotary: rotary position embedding in self-attention, beside the learned vectors of the positions. It tells the
             symbols which part of the motion is theirs.
         object_tokens: True makes a condition token of each object in `observation.environment_state` (its components
-            are named `object.component` in the dataset) and one of each other observation; False makes one of all.
+            are named `object.component` in the dataset) and one of each other observation, such as an image; False
+            makes one of all.
         observation_token_sizes: how many numbers become each condition token; follows from the dataset.
         state_encoder_hidden_dim: hidden units of the MLP that makes a condition token; 0: a linear layer makes it.
         observation_weight_std: size of the initial weights that the observations meet first. Small ones are Diffusion
             Policy's; with them, fine differences in position are learned late.
+        vision_backbone, pretrained_backbone_weights, spatial_softmax_num_keypoints, resize_shape: the encoder of each
+            camera's images, as in LeRobot's `diffusion` policy: a ResNet, torchvision's weights to start from (such as
+            `ResNet18_Weights.IMAGENET1K_V1`), the number of keypoints, and the size (height, width) to which images
+            are resized before, None: not at all.
         num_train_timesteps: N, steps of the Gaussian process.
         prediction_type: what is predicted of the motion: `epsilon` (the noise), `sample` (the clean motion) or
             `v_prediction`.
@@ -126,8 +134,9 @@ class HDPConfig(PreTrainedConfig):
         optimizer_*, scheduler_*: of these, with a linear warm-up and a cosine decay to the last step. The preset's
             learning rate is one for the network that is the default; smaller ones, as in `configs/`, learn faster with
             3e-3, which was too much for it in arranging (docs/tasks/xarm_arrange_blocks.md).
-            `optimizer_betas`, `optimizer_eps`: of AdamW; `optimizer_momentum`: of Muon; `optimizer_fused`: AdamW
-            updates all parameters in one kernel; None: on CUDA.
+            `optimizer_lr_backbone`: of the images' encoder, updated by AdamW (at a higher one, all images soon looked
+            alike to it). `optimizer_betas`, `optimizer_eps`: of AdamW; `optimizer_momentum`: of Muon;
+            `optimizer_fused`: AdamW updates all parameters in one kernel; None: on CUDA.
 
     Raises:
         ParsingError: a value that cannot be. It is draccus' own error, because LeRobot's commands hide the message of
@@ -138,6 +147,9 @@ class HDPConfig(PreTrainedConfig):
     """How symbols are corrupted: `masked` tokens, `gaussian` noise on one-hot vectors, None: there are none."""
     shared_level: ClassVar[bool] = False
     """Whether motion and symbols are always corrupted equally strongly (k_d = k_c), or independently."""
+
+    takes_images: ClassVar[bool] = True
+    """Whether images can be observed. Those of the dataset are, if `input_features` does not choose."""
 
     planned_modalities: ClassVar[tuple[str, ...]] = ("ACTION",)
     """Kinds of features that are denoised, and so must be normalised to [-1, 1]."""
@@ -159,6 +171,10 @@ class HDPConfig(PreTrainedConfig):
     observation_token_sizes: list[int] | None = None
     state_encoder_hidden_dim: int = 0
     observation_weight_std: float | None = None
+    vision_backbone: str = "resnet18"
+    pretrained_backbone_weights: str | None = None
+    spatial_softmax_num_keypoints: int = 32
+    resize_shape: tuple[int, int] | None = None
     num_train_timesteps: int = 100
     prediction_type: str | None = None
     symbol_loss_weight: float | None = None
@@ -180,6 +196,7 @@ class HDPConfig(PreTrainedConfig):
 
     optimizer_type: str | None = None
     optimizer_lr: float | None = None
+    optimizer_lr_backbone: float = 1e-4
     optimizer_betas: tuple[float, float] = (0.9, 0.95)
     optimizer_eps: float = 1e-8
     optimizer_momentum: float = 0.95
@@ -210,6 +227,7 @@ class HDPConfig(PreTrainedConfig):
         _check_choice("sampler", self.sampler, SAMPLERS)
         _check_choice("optimizer_type", self.optimizer_type, OPTIMIZERS)
         _check_choice("mask_schedule", self.mask_schedule, MASK_SCHEDULES)
+        _check_choice("vision_backbone", self.vision_backbone, VISION_BACKBONES)
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
@@ -224,6 +242,8 @@ class HDPConfig(PreTrainedConfig):
             raise ParsingError(f"symbol_lead must be at least 0 and less than 1, got {self.symbol_lead}")
         if self.lead_share and self.symbol_process != "masked":
             raise ParsingError("lead_share is about masked symbols, which this planner does not have: leave it at 0")
+        if self.resize_shape is not None and min(self.resize_shape) < 1:
+            raise ParsingError(f"resize_shape is a height and a width of at least 1, got {self.resize_shape}")
         if self.width % self.num_heads or self.width % 2:
             raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
         if self.rotary and self.width // self.num_heads % 2:
@@ -261,24 +281,31 @@ class HDPConfig(PreTrainedConfig):
             ValueError: the dataset has no symbolic plans, they do not fit, or they speak another vocabulary.
         """
         self.input_features.pop(OBS_SYMBOLIC_PLAN, None)  # token ids are no numbers to normalise
-        for key in self.image_features:
-            logging.warning("%s is left out: the planner takes no images yet", key)
+        for key in self.unused_cameras(self.image_features):
+            logging.warning("%s is left out: a planner of type %s takes no images", key, self.type)
             del self.input_features[key]
-        if OBS_ENV_STATE not in self.input_features:
+        if OBS_ENV_STATE not in self.input_features and not self.image_features:
             logging.warning("There is no %s: the planner does not see where the objects are", OBS_ENV_STATE)
         if self.observation_token_sizes is None:
             self.observation_token_sizes = self._token_sizes(features)
         if self.symbol_process is not None:
             self._set_symbols(features)
 
+    def unused_cameras(self, cameras: Iterable[str]) -> list[str]:
+        """Those of a dataset's cameras that are not observed."""
+        if not self.takes_images:
+            return list(cameras)
+        return [key for key in cameras if self.input_features and key not in self.input_features]
+
     def _token_sizes(self, features: dict[str, dict]) -> list[int]:
         """Sizes of the condition tokens, see `object_tokens`."""
         lengths = {key: math.prod(feature.shape) for key, feature in self.input_features.items()}
+        lengths |= dict.fromkeys(self.image_features, image_feature_size(self.spatial_softmax_num_keypoints))
         if not self.object_tokens:
             return [sum(lengths.values())]
         sizes = []
         for key, length in lengths.items():
-            names = features[key].get("names")
+            names = features.get(key, {}).get("names")
             names_components = key == OBS_ENV_STATE and isinstance(names, list) and len(names) == length
             sizes += object_sizes(names) if names_components else [length]
         return sizes
@@ -308,9 +335,16 @@ class HDPConfig(PreTrainedConfig):
 
     def validate_features(self) -> None:
         if not self.input_features:
-            raise ValueError("the planner needs at least one of observation.state and observation.environment_state")
+            raise ValueError("the planner has nothing to observe: the dataset has no column that it can take")
         if self.action_feature is None:
             raise ValueError("the dataset has no column 'action'")
+        for key, feature in self.image_features.items():
+            height, width = self.resize_shape or feature.shape[1:]
+            if min(height, width) <= BACKBONE_STRIDE:
+                raise ValueError(
+                    f"{key} has {height} x {width} pixels, of which the image encoder sees one cell: record more than "
+                    f"{BACKBONE_STRIDE} either way, or enlarge the images with --policy.resize_shape"
+                )
         symbols_known = self.vocabulary is not None and self.symbolic_horizon is not None
         if self.observation_token_sizes is None or (self.symbol_process is not None and not symbols_known):
             raise ValueError("a planner learns its sizes and its vocabulary from a dataset: train it before use")

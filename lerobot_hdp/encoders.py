@@ -2,13 +2,18 @@
 
 from collections.abc import Iterable, Mapping
 from itertools import groupby
+from typing import Any
 
 import torch
+from lerobot.configs import PolicyFeature
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.diffusion.modeling_diffusion import DiffusionRgbEncoder
 from torch import Tensor, nn
+from torchvision.models import get_model
 
 
 class StateEncoder(nn.Module):
-    """Condition tokens from the low-dimensional observations.
+    """Condition tokens from observations that are vectors: low-dimensional ones, and the features of images.
 
     The observations are concatenated and cut into parts; each part becomes a token. One part is Diffusion Policy's
     way. With a part for each object, attention can look up the one that a symbol names, instead of finding its
@@ -51,6 +56,64 @@ class StateEncoder(nn.Module):
         state = torch.cat([batch[key].reshape(len(batch[key]), -1) for key in self.keys], dim=-1)
         parts = state.split(self.token_sizes, dim=-1)
         return torch.stack([project(part) for project, part in zip(self.projections, parts, strict=True)], dim=1)
+
+
+class ImageEncoder(nn.Module):
+    """Features of the observed images, by LeRobot's encoder of Diffusion Policy, one for each camera.
+
+    A ResNet whose last feature maps are read as keypoints: of each, where in the image it is most active (spatial
+    softmax; Finn et al. 2016, "Deep Spatial Autoencoders for Visuomotor Learning"). A new one has group normalisation;
+    a pretrained one keeps the batch statistics that it comes with, since an average of weights has none of its own.
+
+    Args:
+        cameras: names of the observed images, and their shapes (3, height, width).
+        vision_backbone: a ResNet of torchvision.
+        pretrained_backbone_weights: the name of its weights there; None: it is a new one.
+        options: more of `DiffusionConfig`.
+    """
+
+    def __init__(
+        self,
+        cameras: Mapping[str, PolicyFeature],
+        vision_backbone: str,
+        pretrained_backbone_weights: str | None,
+        **options: Any,
+    ):
+        super().__init__()
+        self.cameras = list(cameras)
+        self.encoders = nn.ModuleList()
+        for name, camera in cameras.items():
+            config = DiffusionConfig(
+                input_features={name: camera},
+                vision_backbone=vision_backbone,
+                pretrained_backbone_weights=pretrained_backbone_weights,
+                use_group_norm=pretrained_backbone_weights is None,
+                device="cpu",
+                **options,
+            )
+            encoder = DiffusionRgbEncoder(config)
+            if pretrained_backbone_weights is not None:
+                # To learn the size of its feature maps, it was shown a black image, which moved the batch statistics.
+                backbone = get_model(vision_backbone, weights=pretrained_backbone_weights)
+                encoder.backbone.load_state_dict(nn.Sequential(*list(backbone.children())[:-2]).state_dict())
+            self.encoders.append(encoder)
+
+    def train(self, mode: bool = True) -> "ImageEncoder":
+        """Batch statistics stay as they are."""
+        super().train(mode)
+        for module in self.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eval()
+        return self
+
+    def forward(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Normalised images (B, 3, height, width) of each camera -> (B, `image_feature_size`) of each."""
+        return {camera: encode(batch[camera]) for camera, encode in zip(self.cameras, self.encoders, strict=True)}
+
+
+def image_feature_size(num_keypoints: int) -> int:
+    """Numbers that an image becomes: two coordinates of each keypoint, mixed by a linear layer."""
+    return 2 * num_keypoints
 
 
 def object_sizes(names: Iterable[str]) -> list[int]:

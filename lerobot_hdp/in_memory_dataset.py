@@ -42,12 +42,13 @@ class InMemoryDataset(LeRobotDataset):
     Args:
         dataset: what to load; `unsupported(dataset, leave_out)` must be None.
         leave_out: cameras that the samples need not have.
+        first_images_only: hold each camera's first image of each episode alone, for samples that begin there.
 
     Raises:
         ValueError: it cannot be held in memory.
     """
 
-    def __init__(self, dataset: LeRobotDataset, leave_out: Collection[str] = ()):
+    def __init__(self, dataset: LeRobotDataset, leave_out: Collection[str] = (), first_images_only: bool = False):
         vars(self).update(vars(dataset))
         if (reason := unsupported(dataset, leave_out)) is not None:
             raise ValueError(f"{dataset.repo_id} cannot be held in memory: {reason}")
@@ -56,32 +57,49 @@ class InMemoryDataset(LeRobotDataset):
         episodes, inverse, lengths = self._columns["episode_index"].unique_consecutive(
             return_inverse=True, return_counts=True
         )
-        timestamps = self._columns["timestamp"].split(lengths.tolist())
-        seconds = {episode: times.tolist() for episode, times in zip(episodes.tolist(), timestamps, strict=True)}
-        for key in (key for key in self._cameras if key in self.meta.video_keys):
-            self._columns[key] = _join(dataset.num_frames, _decode_videos(dataset, key, seconds))
         ends = lengths.cumsum(0)
         self._first, self._last = (ends - lengths)[inverse], (ends - 1)[inverse]
+        held = ends - lengths if first_images_only else torch.arange(len(inverse))
+        self._image_of_frame = torch.full_like(inverse, -1).scatter(0, held, torch.arange(len(held)))
+        timestamps = self._columns["timestamp"][held].split(inverse[held].bincount().tolist())
+        seconds = {episode: times.tolist() for episode, times in zip(episodes.tolist(), timestamps, strict=True)}
+        for key in self._cameras:
+            in_videos = key in self.meta.video_keys
+            images = _decode_videos(dataset, key, seconds) if in_videos else _read_images(dataset, key, held)
+            self._columns[key] = _join(len(held), images)
         self._offsets = {key: torch.tensor(deltas) for key, deltas in (self.reader.delta_indices or {}).items()}
         self._tasks = list(self.meta.tasks.index)
 
     def __getitems__(self, indices: list[int]) -> list[Batch]:
-        """The samples of some frames, collated: each column (B, ...), or (B, T, ...) where it has delta timestamps."""
+        """The samples of some frames, collated: each column (B, ...), or (B, T, ...) where it has delta timestamps.
+
+        Raises:
+            ValueError: an image is not held.
+        """
         rows = torch.tensor(indices)
         first, last = self._first[rows, None], self._last[rows, None]
         batch = Batch({key: [words[i] for i in indices] for key, words in self._words.items()})
         for key, column in self._columns.items():
             if key not in self._offsets:
-                batch[key] = column[rows]
+                batch[key] = column[self._place(key, rows)]
                 continue
             window = rows[:, None] + self._offsets[key]
-            batch[key] = column[torch.minimum(torch.maximum(window, first), last)]
+            batch[key] = column[self._place(key, torch.minimum(torch.maximum(window, first), last))]
             batch[f"{key}_is_pad"] = (window < first) | (window > last)
             if key in self.meta.video_keys and window.shape[1] == 1:
                 batch[key] = batch[key].squeeze(1)  # as LeRobot has it
         self._finish_images(batch)
         batch["task"] = [self._tasks[i] for i in batch["task_index"].tolist()]
         return [batch]
+
+    def _place(self, key: str, frames: Tensor) -> Tensor:
+        """Where a column has what it holds of some frames."""
+        if key not in self._cameras:
+            return frames
+        places = self._image_of_frame[frames]
+        if (places < 0).any():
+            raise ValueError(f"of {key}, the first image of each episode alone is held in memory")
+        return places
 
     def _finish_images(self, batch: Batch) -> None:
         """uint8 to float where LeRobot has it so, and the image transforms, sample by sample as LeRobot draws them."""
@@ -106,14 +124,17 @@ def unsupported(dataset: LeRobotDataset, leave_out: Collection[str] = ()) -> str
     return None
 
 
-def memory_needed(dataset: LeRobotDataset, leave_out: Collection[str] = ()) -> int:
-    """Bytes that the dataset takes as tensors."""
-    per_frame = 0
+def memory_needed(dataset: LeRobotDataset, leave_out: Collection[str] = (), first_images_only: bool = False) -> int:
+    """Bytes that the dataset takes as tensors; see `InMemoryDataset`."""
+    images = dataset.num_episodes if first_images_only else dataset.num_frames
+    needed = 0
     for key, feature in _held_features(dataset, leave_out).items():
-        if feature["dtype"] != "string":
-            size = 1 if key in dataset.meta.camera_keys else 8 if "int" in feature["dtype"] else 4
-            per_frame += size * math.prod(feature["shape"])
-    return per_frame * dataset.num_frames
+        numbers = math.prod(feature["shape"])
+        if key in dataset.meta.camera_keys:
+            needed += numbers * images
+        elif feature["dtype"] != "string":
+            needed += numbers * dataset.num_frames * (8 if "int" in feature["dtype"] else 4)
+    return needed
 
 
 def _held_features(dataset: LeRobotDataset, leave_out: Collection[str]) -> dict[str, dict[str, Any]]:
@@ -125,17 +146,17 @@ def _held_features(dataset: LeRobotDataset, leave_out: Collection[str]) -> dict[
 def _read_columns(
     dataset: LeRobotDataset, leave_out: Collection[str]
 ) -> tuple[dict[str, Tensor], dict[str, list[str]]]:
-    """Columns of the dataset's table as tensors (N, ...), of the types that LeRobot makes them; and those of words."""
+    """Columns of the dataset's table as tensors (N, ...), of the types that LeRobot makes them; and those of words.
+
+    Images are not among them.
+    """
     table = dataset.hf_dataset.with_format(None)
     columns, words = {}, {}
-    held = _held_features(dataset, leave_out)
+    held = _held_features(dataset, [*leave_out, *dataset.meta.camera_keys])
     for key in table.column_names:
         if key not in held:
             continue
-        if key in dataset.meta.image_keys:
-            images = (np.atleast_3d(np.array(row[key])) for row in table.select_columns(key))
-            columns[key] = _join(len(table), (torch.from_numpy(image).permute(2, 0, 1)[None] for image in images))
-        elif held[key]["dtype"] == "string":
+        if held[key]["dtype"] == "string":
             words[key] = table[key][:]
         else:
             values = np.stack(table.select_columns(key).with_format("numpy")[:][key])
@@ -144,13 +165,20 @@ def _read_columns(
     return columns, words
 
 
+def _read_images(dataset: LeRobotDataset, key: str, frames: Tensor) -> Iterator[Tensor]:
+    """A camera's images in some frames, where they are in the dataset's table: (1, C, H, W) uint8 each."""
+    rows = dataset.hf_dataset.with_format(None).select_columns(key).select(frames.tolist())
+    for row in tqdm(rows, desc=f"Decoding {key}", unit="image"):
+        yield torch.from_numpy(np.atleast_3d(np.array(row[key]))).permute(2, 0, 1)[None]
+
+
 def _decode_videos(dataset: LeRobotDataset, key: str, seconds: dict[int, list[float]]) -> Iterator[Tensor]:
-    """The frames of a camera in each episode: (n, C, H, W) uint8.
+    """Frames of a camera in each episode: (n, C, H, W) uint8.
 
     Args:
         dataset: where the videos are.
         key: of the camera.
-        seconds: for each episode, the timestamps of its frames, from its beginning.
+        seconds: for each episode, the timestamps of the frames, from its beginning.
     """
     for index, timestamps in tqdm(seconds.items(), desc=f"Decoding {key}", unit="episode"):
         first = dataset.meta.episodes[index][f"videos/{key}/from_timestamp"]

@@ -20,7 +20,7 @@ from torch import Generator, Tensor, nn
 from .candidates import PARTIAL_MOTION_CANDIDATES, best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
-from .encoders import StateEncoder
+from .encoders import ImageEncoder, StateEncoder
 from .model_card import describe_planner
 from .moving_average import MovingAverage
 from .optimizer import parameter_groups
@@ -49,7 +49,7 @@ def _without_dropout[**P, R](method: Callable[P, R]) -> Callable[P, R]:
 
 
 class Planner(nn.Module):
-    """The network that is trained: the observation's encoder and the denoiser."""
+    """The network that is trained: the observation's encoders and the denoiser."""
 
     def __init__(self, config: HDPConfig, symbol_states: int):
         super().__init__()
@@ -60,6 +60,15 @@ class Planner(nn.Module):
             config.observation_weight_std,
             config.state_encoder_hidden_dim,
         )
+        self.image_encoder = None
+        if config.image_features:
+            self.image_encoder = ImageEncoder(
+                config.image_features,
+                config.vision_backbone,
+                config.pretrained_backbone_weights,
+                spatial_softmax_num_keypoints=config.spatial_softmax_num_keypoints,
+                resize_shape=config.resize_shape,
+            )
         self.denoiser = Denoiser(
             action_dim=config.action_feature.shape[0],
             horizon=config.horizon,
@@ -76,9 +85,19 @@ class Planner(nn.Module):
             rotary=config.rotary,
         )
 
+    def encode(self, batch: dict[str, Tensor]) -> Tensor:
+        """Preprocessed observations -> condition tokens (B, n, width)."""
+        features = self.image_encoder(batch) if self.image_encoder is not None else {}
+        return self.encoder({**batch, **features})
+
     @property
     def denoisers(self) -> list[Denoiser]:
         return [self.denoiser]
+
+    @property
+    def backbone(self) -> list[nn.Parameter]:
+        """What is trained at `optimizer_lr_backbone`."""
+        return [] if self.image_encoder is None else list(self.image_encoder.parameters())
 
 
 class HDPPolicy(PreTrainedPolicy):
@@ -129,7 +148,8 @@ class HDPPolicy(PreTrainedPolicy):
 
     def get_optim_params(self) -> list[dict]:
         matrices = [matrix for denoiser in self.planner.denoisers for matrix in denoiser.hidden_matrices]
-        return parameter_groups(self.planner, matrices if self.config.optimizer_type == "muon" else ())
+        for_muon = matrices if self.config.optimizer_type == "muon" else ()
+        return parameter_groups(self.planner, for_muon, self.planner.backbone, self.config.optimizer_lr_backbone)
 
     def reset(self) -> None:
         """Forget the plan in execution. To be called on `env.reset()`."""
@@ -203,7 +223,7 @@ class HDPPolicy(PreTrainedPolicy):
         levels = self._sample_levels(self.motion_process, len(motion), generator)
         levels = levels.masked_fill(self._symbols_lead(levels, generator), 1.0)
         noisy_motion = self._corrupt(self.motion_process, motion, levels, generator)
-        observation, k_c = network.encoder(batch), noisy_motion.level
+        observation, k_c = network.encode(batch), noisy_motion.level
         if self.symbol_process is None:
             prediction = network.denoiser(noisy_motion.value, None, observation, k_c, torch.zeros_like(k_c))
             loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
@@ -407,7 +427,7 @@ class HDPPolicy(PreTrainedPolicy):
     def _denoiser(self, batch: dict[str, Tensor]) -> Denoise:
         """The denoiser for the observations of a batch."""
         network = self._planning_network
-        observation = network.encoder(batch)
+        observation = network.encode(batch)
 
         def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
             with self._autocast():

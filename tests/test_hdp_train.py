@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
@@ -22,6 +23,7 @@ from safetensors.torch import load_file
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_hdp import HDPConfig
+from lerobot_hdp.baselines.configuration_hierarchical import HierarchicalDiffuserConfig
 from lerobot_hdp.in_memory_dataset import InMemoryDataset, memory_needed, unsupported
 from lerobot_hdp.scripts import hdp_train
 
@@ -182,13 +184,33 @@ def test_workers_are_kept_for_image_transforms_alone(camera_root, open_datasets,
 
 def test_cameras_take_no_memory_and_no_time_when_the_policy_has_no_use_for_them(camera_root, open_datasets):
     whole = memory_needed(LeRobotDataset("test/cameras", root=camera_root)) / hdp_train.GIB
-    planner = HDPConfig(horizon=3, device="cpu")
+    planner = HierarchicalDiffuserConfig(horizon=3, device="cpu")
     (dataset, _), _ = open_datasets(camera_root, max_gib=whole / 2, policy=planner)
     [batch] = dataset.__getitems__([3, 5])
-    assert batch["action"].shape == (2, 3, 3)
+    assert batch["action"].shape == (2, 4, 3)
     assert not any("images" in key for key in batch)
     (dataset, _), _ = open_datasets(camera_root, max_gib=whole / 2)
     assert not isinstance(dataset, InMemoryDataset)
+
+
+def test_planners_of_whole_episodes_hold_first_images_alone(camera_root, open_datasets):
+    whole = LeRobotDataset("test/cameras", root=camera_root, video_backend="pyav", return_uint8=True)
+    chosen = {"observation.images.wrist": PolicyFeature(FeatureType.VISUAL, (3, 32, 48))}
+    planner = HDPConfig(horizon=3, device="cpu", input_features=chosen)
+    budget = memory_needed(whole, ["observation.images.front"], first_images_only=True)
+    (dataset, _), _ = open_datasets(camera_root, max_gib=budget / hdp_train.GIB, policy=planner)
+    assert isinstance(dataset, InMemoryDataset)
+    first = [0, 7, 11, 20]
+    [batch] = dataset.__getitems__(first[::-1])
+    assert "observation.images.front" not in batch
+    expected = torch.stack([whole[frame]["observation.images.wrist"] for frame in first[::-1]])
+    assert torch.equal(batch["observation.images.wrist"], expected)
+    with pytest.raises(ValueError, match="the first image of each episode alone is held"):
+        dataset.__getitems__([0, 1])
+    planner.plan_from = "any_frame"
+    (dataset, _), _ = open_datasets(camera_root, policy=planner)
+    [batch] = dataset.__getitems__([1])
+    assert torch.equal(batch["observation.images.wrist"][0], whole[1]["observation.images.wrist"])
 
 
 @pytest.mark.parametrize(("share", "held"), [(1.1, True), (0.75, False)])

@@ -280,20 +280,6 @@ def test_any_frame_trains_on_what_remains(make_planner, dataset):
         assert sum(parts[name] for parts in history[-10:]) < 0.7 * sum(parts[name] for parts in history[:10])
 
 
-def test_cameras_are_left_out(dataset, caplog):
-    camera = {"dtype": "video", "shape": (32, 48, 3), "names": ["height", "width", "channels"], "info": None}
-    config = HDPConfig(**TINY_PLANNER, device="cpu")
-    config.input_features = {
-        "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 32, 48)),
-        "observation.state": PolicyFeature(FeatureType.STATE, (3,)),
-    }
-    config.set_dataset_feature_metadata({**dataset.meta.features, "observation.images.front": camera})
-    assert list(config.input_features) == ["observation.state"]
-    assert config.observation_token_sizes == [3]
-    assert "observation.images.front is left out" in caplog.text
-    assert "the planner does not see where the objects are" in caplog.text
-
-
 def test_an_open_prompt_stays_open_where_it_is_filled(make_planner, batch):
     """An environment may know a shorter plan than the planner makes."""
     policy, preprocessor, _ = make_planner(symbolic_horizon=24)

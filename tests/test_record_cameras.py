@@ -22,8 +22,8 @@ from gym_hdp_tasks.env_config import HDPEnv
 
 from .conftest import DIFFUSION_FLAGS, run_command
 
-SORTING = HDPEnv(task="XArmSorting-v0", obs_type="pixels_state", camera_height=32, camera_width=48)
-ARRANGE = HDPEnv(task="XArmArrangeBlocks-v0", obs_type="pixels_state", camera_height=32, camera_width=48)
+SORTING = HDPEnv(task="XArmSorting-v0", obs_type="pixels_state", camera_height=40, camera_width=48)
+ARRANGE = HDPEnv(task="XArmArrangeBlocks-v0", obs_type="pixels_state", camera_height=40, camera_width=48)
 IMAGES = ("observation.images.front", "observation.images.wrist")
 N_EPISODES = 2
 
@@ -71,7 +71,7 @@ def test_a_video_shows_what_the_environment_showed(dataset):
 
 
 def test_images_can_be_kept_without_loss(tmp_path):
-    pixels = HDPEnv(task=ARRANGE.task, obs_type="pixels", camera_height=32, camera_width=48)
+    pixels = HDPEnv(task=ARRANGE.task, obs_type="pixels", camera_height=40, camera_width=48)
     dataset = record(config(tmp_path / "images", pixels, num_episodes=1, video=False))
     assert not {"observation.state", "observation.environment_state"} & set(dataset.features)
     env = gym.make(pixels.gym_id, disable_env_checker=True, **pixels.gym_kwargs)

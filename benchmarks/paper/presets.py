@@ -14,11 +14,13 @@ from ..cells import Cell
 METHODS = ("hdp", "diffuser", "joint_diffuser", "separate_diffuser", "hd", "chd")
 """Policy types, in the order in which they are worth running."""
 HIERARCHICAL = ("hd", "chd")
-"""Two networks each, so that their size is reported and not matched."""
+"""Two networks each, so that their size is reported and not matched. They plan observations, but no images."""
+IMAGES_ALONE = {"obs_type": "pixels", "camera_names": ["front"]}
 ENVS: dict[str, dict[str, Any]] = {
     "xarm_sorting": {"task": "XArmSorting-v0"},
     "xarm_arrange_blocks": {"task": "XArmArrangeBlocks-v0"},
     "xarm_tool_use": {"task": "XArmToolUse-v0"},
+    "xarm_sorting_images": {"task": "XArmSorting-v0", **IMAGES_ALONE},
     "block_sorting_2d_2_blocks": {"task": "BlockSorting2D-v0", "n_blocks": 2, "waypoints_per_pose": 1},
     "block_sorting_2d_3_blocks": {"task": "BlockSorting2D-v0", "n_blocks": 3, "waypoints_per_pose": 1},
     "block_sorting_2d_4_blocks": {"task": "BlockSorting2D-v0", "n_blocks": 4, "waypoints_per_pose": 1},
@@ -68,6 +70,7 @@ def _steps(epochs: int, demonstrations: int, batch_size: int) -> int:
 
 _MINI_2D = {"num_layers": 5, "width": 112, "num_inference_steps": 20}
 _MINI_XARM = {"num_layers": 4, "width": 128}
+_PRETRAINED = {"pretrained_backbone_weights": "ResNet18_Weights.IMAGENET1K_V1"}
 _SMALL_LR = {"optimizer_lr": 3e-3}
 _AT_FIRST_THRESHOLD = {"confidence_threshold": 0.8}
 _BEFORE_MUON = {"optimizer_type": "adamw", "symbol_lead": 0.0, **_AT_FIRST_THRESHOLD}
@@ -85,6 +88,7 @@ PRESETS: dict[str, Preset] = {
         policy={"preset": "paper"},
         tasks={
             "xarm_sorting": Training(200, _steps(5_000, 200, 64), 64, {"symbolic_horizon": 108}),
+            "xarm_sorting_images": Training(200, _steps(20_000, 200, 64), 64, {"symbolic_horizon": 108, **_PRETRAINED}),
             "xarm_arrange_blocks": Training(4_000, _steps(5_000, 4_000, 64), 64),
             "xarm_tool_use": Training(4_000, _steps(10_000, 4_000, 64), 64),
         },
@@ -111,6 +115,7 @@ PRESETS: dict[str, Preset] = {
             "xarm_sorting": Training(200, 2_400, 50),
             "xarm_arrange_blocks": Training(4_000, 5_000, 50, _MANY_DEMONSTRATIONS),
             "xarm_tool_use": Training(400, 2_000, 50),
+            "xarm_sorting_images": Training(200, 1_500, 50),
             **_TASKS_2D,
         },
     ),
@@ -211,6 +216,11 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
     )
 
 
+def exists(method: str, preset: str, task: str) -> bool:
+    """Whether a preset has a task, and a method can do it."""
+    return task in PRESETS[preset].tasks and not (method in HIERARCHICAL and "obs_type" in ENVS[task])
+
+
 def stage(preset: str, method: str, task: str) -> int:
     """What of a seed comes first: of the paper's tasks our HDP, our Diffuser, then the paper's HDP."""
     if preset == "default" and method in ("hdp", "diffuser") and task not in _TASKS_2D:
@@ -228,5 +238,5 @@ def make_cells(presets: list[str], tasks: list[str], methods: list[str], seeds: 
         seed, method, preset, task = choice
         return seed, stage(preset, method, task), METHODS.index(method), list(PRESETS).index(preset), TASKS.index(task)
 
-    choices = [choice for choice in product(seeds, methods, presets, tasks) if choice[3] in PRESETS[choice[2]].tasks]
+    choices = [choice for choice in product(seeds, methods, presets, tasks) if exists(*choice[1:])]
     return [make_cell(preset, task, method, seed) for seed, method, preset, task in sorted(choices, key=worth)]

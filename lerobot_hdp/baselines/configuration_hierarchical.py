@@ -29,6 +29,7 @@ class HierarchicalDiffuserConfig(HDPConfig):
     """
 
     symbol_process = None
+    takes_images = False
     coupled: ClassVar[bool] = False
     """Whether both levels are denoised together."""
 

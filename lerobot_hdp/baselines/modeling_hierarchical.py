@@ -88,6 +88,10 @@ class HierarchicalPlanner(nn.Module):
     def denoisers(self) -> list[Denoiser]:
         return [self.high, self.low]
 
+    @property
+    def backbone(self) -> list[nn.Parameter]:
+        return []
+
 
 class HierarchicalDiffuserPolicy(HDPPolicy):
     """Plans sub-goals, then the segments between them."""

@@ -9,7 +9,7 @@ import json
 import logging
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import indent
 from typing import Any, NamedTuple
@@ -28,6 +28,7 @@ from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_proc
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from torch import Tensor
@@ -156,6 +157,8 @@ def make_plan(config: PlanConfig) -> Result:
         raise ValueError("--check=true chooses among candidates: set --policy.num_candidates to more than 1")
     if config.check and policy.vocabulary is None:
         raise ValueError("--check=true: this planner models no symbols, so there is no plan to check")
+    if getattr(config.env, "obs_type", None) == "pixels":
+        config.env = replace(config.env, obs_type="pixels_state")  # the checker looks at the objects' poses
     env_preprocessor, _ = make_env_pre_post_processors(config.env, config.policy)
     task = getattr(config.env, "planning_task", None)
     if task is not None:
@@ -218,8 +221,9 @@ def explain(config: PlanConfig) -> str:
         dataset = LeRobotDataset(source.repo_id, root=source.root, delta_timestamps=windows, video_backend="pyav")
     except (OSError, HTTPError) as error:
         raise ValueError(f"the dataset {source.repo_id} is not in {source.root}, nor to be had: {error}") from error
+    features = dataset_to_policy_features(dataset.meta.features)
     for key, feature in {**policy.config.input_features, **policy.config.output_features}.items():
-        shape = tuple(dataset.meta.features.get(key, {}).get("shape", ()))
+        shape = features[key].shape if key in features else None
         if shape != feature.shape:
             raise ValueError(f"the planner knows {key} of shape {feature.shape}, the dataset has {shape or 'none'}")
     if not 0 <= config.explain < dataset.num_episodes:

@@ -50,14 +50,18 @@ def hold_datasets_in_memory(max_gib: float) -> None:
         users_num_workers = cfg.num_workers
         train_and_eval = make_datasets(cfg)
         opened = [dataset for dataset in train_and_eval if dataset is not None]
-        # The planners take no images: their cameras need not be decoded.
-        leave_out = opened[0].meta.camera_keys if isinstance(cfg.policy, HDPConfig) else []
-        if (reason := _why_not_in_memory(opened, leave_out, max_gib)) is not None:
+        is_planner = isinstance(cfg.policy, HDPConfig)
+        leave_out = cfg.policy.unused_cameras(opened[0].meta.camera_keys) if is_planner else []
+        first_images_only = _plans_whole_episodes(cfg)
+        if (reason := _why_not_in_memory(opened, leave_out, first_images_only, max_gib)) is not None:
             logging.warning("The dataset is read item by item, as by lerobot-train: %s", reason)
             return train_and_eval
         if all(dataset.image_transforms is None for dataset in opened):
             cfg.num_workers = 0  # there is nothing to wait for; image transforms are made sample by sample
-        return tuple(None if dataset is None else InMemoryDataset(dataset, leave_out) for dataset in train_and_eval)
+        return tuple(
+            None if dataset is None else InMemoryDataset(dataset, leave_out, first_images_only)
+            for dataset in train_and_eval
+        )
 
     def save_with_users_num_workers(*args: Any, cfg: TrainPipelineConfig, **kwargs: Any) -> None:
         cfg.num_workers = users_num_workers  # for whoever resumes with lerobot-train
@@ -94,7 +98,7 @@ def start_where_plans_begin() -> None:
 
     def make_datasets_of_first_frames(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, Dataset | None]:
         train, held_out = make_datasets(cfg)
-        whole_plans = isinstance(cfg.policy, HDPConfig) and cfg.policy.plan_from == "episode_start"
+        whole_plans = _plans_whole_episodes(cfg)
         lerobot_train.EpisodeAwareSampler = FirstFrameSampler if whole_plans else EpisodeAwareSampler
         if held_out is None or not whole_plans:
             return train, held_out
@@ -130,12 +134,19 @@ def hold_process_group() -> list[ProcessGroup]:
     return held
 
 
-def _why_not_in_memory(opened: list[LeRobotDataset], leave_out: list[str], max_gib: float) -> str | None:
+def _plans_whole_episodes(cfg: TrainPipelineConfig) -> bool:
+    """Whether the policy is trained on the first frames of episodes alone."""
+    return isinstance(cfg.policy, HDPConfig) and cfg.policy.plan_from == "episode_start"
+
+
+def _why_not_in_memory(
+    opened: list[LeRobotDataset], leave_out: list[str], first_images_only: bool, max_gib: float
+) -> str | None:
     """What keeps datasets from being held in memory together, in words; None: nothing."""
     for dataset in opened:
         if (reason := unsupported(dataset, leave_out)) is not None:
             return reason
-    needed = sum(memory_needed(dataset, leave_out) for dataset in opened) / GIB
+    needed = sum(memory_needed(dataset, leave_out, first_images_only) for dataset in opened) / GIB
     return f"it needs {needed:.1f} GiB, more than --max_memory_gib={max_gib:g}" if needed > max_gib else None
 
 
