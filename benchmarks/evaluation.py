@@ -4,7 +4,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,11 +113,9 @@ def load(path: Path, starts: int, gym_id: str | None = None, first_seed: int = 0
         options: see `load_policy`.
     """
     policy, preprocessor, postprocessor = load_policy(path, **options)
-    env_config = TrainPipelineConfig.from_pretrained(path).env
+    env_config = TrainPipelineConfig.from_pretrained(path).env.with_poses()
     task = env_config.planning_task
     gym_id = gym_id or task.gym_id
-    if env_config.obs_type == "pixels":
-        env_config = replace(env_config, obs_type="pixels_state")  # the checker looks at the objects' poses
     env = gym.make(gym_id, disable_env_checker=True, **env_config.gym_kwargs)
     seeds = range(first_seed, first_seed + starts)
     observations = [env.reset(seed=seed)[0] for seed in seeds]

@@ -1,7 +1,7 @@
 """`--env.type=hdp`: LeRobot's view of the tasks."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from draccus.utils import ParsingError
@@ -68,8 +68,11 @@ class HDPEnv(EnvConfig):
             raise ParsingError(str(error)) from error
         if self.obs_type not in OBS_TYPES:
             raise ParsingError(f"--env.obs_type must be one of {OBS_TYPES}, got {self.obs_type!r}")
-        if not self.camera_names or not set(self.camera_names) <= set(CAMERAS):
-            raise ParsingError(f"--env.camera_names must be some of {CAMERAS}, got {self.camera_names}")
+        self.camera_names = tuple(self.camera_names)
+        if not 0 < len(self.camera_names) == len(set(self.camera_names) & set(CAMERAS)):
+            raise ParsingError(f"--env.camera_names is a list, as [front], of {CAMERAS}, got {self.camera_names}")
+        if self.obs_type == "state" and self.camera_names != CAMERAS:
+            raise ParsingError("--env.camera_names chooses among images: add --env.obs_type=pixels, or pixels_state")
         others = BLOCK_SORTING_2D_ONLY if self._is_xarm else XARM_ONLY
         for field in fields(self):
             if field.name in others and getattr(self, field.name) != field.default:
@@ -88,6 +91,10 @@ class HDPEnv(EnvConfig):
             image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.camera_height, self.camera_width, 3))
             self.features |= {f"pixels/{camera}": image for camera in self.camera_names}
             self.features_map |= {f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in self.camera_names}
+
+    def with_poses(self) -> "HDPEnv":
+        """The same, where the objects' poses are observed, too: the task's checker of plans looks at them."""
+        return replace(self, obs_type="pixels_state") if self.obs_type == "pixels" else self
 
     @property
     def planning_task(self) -> PlanningTask:

@@ -2,14 +2,16 @@
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from draccus.utils import ParsingError
-from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.configs import NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
+from lerobot.utils.feature_utils import dataset_to_policy_features
+from torchvision.models import get_model_weights
 
 from .encoders import image_feature_size, object_sizes
 from .optimizer import OPTIMIZERS, FusedAdamWConfig, MuonAdamWConfig
@@ -25,6 +27,8 @@ keeps only `observation.*` columns."""
 VISION_BACKBONES = ["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
 BACKBONE_STRIDE = 32
 """Pixels from one cell of its feature maps to the next."""
+RGB = 3
+"""Channels of an image."""
 SAMPLERS = ["ddpm", "ddim", "confidence"]
 
 AT_LEAST_1 = ["num_layers", "num_heads", "width", "num_train_timesteps", "horizon", "symbolic_horizon"]
@@ -97,9 +101,9 @@ class HDPConfig(PreTrainedConfig):
         observation_weight_std: size of the initial weights that the observations meet first. Small ones are Diffusion
             Policy's; with them, fine differences in position are learned late.
         vision_backbone, pretrained_backbone_weights, spatial_softmax_num_keypoints, resize_shape: the encoder of each
-            camera's images, as in LeRobot's `diffusion` policy: a ResNet, torchvision's weights to start from (such as
-            `ResNet18_Weights.IMAGENET1K_V1`), the number of keypoints, and the size (height, width) to which images
-            are resized before, None: not at all.
+            camera's images, that of LeRobot's `diffusion` policy, without its crops: a ResNet, torchvision's weights to
+            start from (such as `ResNet18_Weights.IMAGENET1K_V1`; None: it is trained from scratch), the number of
+            keypoints, and the size (height, width) to which images of any size are resized before, None: not at all.
         num_train_timesteps: N, steps of the Gaussian process.
         prediction_type: what is predicted of the motion: `epsilon` (the noise), `sample` (the clean motion) or
             `v_prediction`.
@@ -127,7 +131,7 @@ class HDPConfig(PreTrainedConfig):
         num_candidates: plans that are drawn for each observation, of which the most likely is executed.
 
         compile_model, compile_mode: run the denoiser through `torch.compile`.
-        dtype: `float32`, or `bfloat16` for autocast in training and planning.
+        dtype: `float32`, or `bfloat16` for autocast: of all in training, of the denoiser in planning.
 
         optimizer_type: `muon` updates the matrices between hidden layers by Muon and the rest by AdamW (optimizer.py),
             `adamw` all by AdamW.
@@ -228,6 +232,9 @@ class HDPConfig(PreTrainedConfig):
         _check_choice("optimizer_type", self.optimizer_type, OPTIMIZERS)
         _check_choice("mask_schedule", self.mask_schedule, MASK_SCHEDULES)
         _check_choice("vision_backbone", self.vision_backbone, VISION_BACKBONES)
+        if self.pretrained_backbone_weights is not None:
+            choices = [str(weights) for weights in get_model_weights(self.vision_backbone)]
+            _check_choice("pretrained_backbone_weights", self.pretrained_backbone_weights, choices)
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
@@ -281,9 +288,15 @@ class HDPConfig(PreTrainedConfig):
             ValueError: the dataset has no symbolic plans, they do not fit, or they speak another vocabulary.
         """
         self.input_features.pop(OBS_SYMBOLIC_PLAN, None)  # token ids are no numbers to normalise
-        for key in self.unused_cameras(self.image_features):
-            logging.warning("%s is left out: a planner of type %s takes no images", key, self.type)
-            del self.input_features[key]
+        for key, feature in self.image_features.items():
+            if not self.observes_camera(key, feature):
+                what = "images" if not self.takes_images else "images but of three colours, named observation.*"
+                logging.warning("%s is left out: a planner of type %s takes no %s", key, self.type, what)
+                del self.input_features[key]
+        if self.pretrained_path is None:
+            _check_shapes(self.input_features, dataset_to_policy_features(features))
+        if self.image_features:
+            logging.info("Observed through a %s each: %s", self.vision_backbone, ", ".join(self.image_features))
         if OBS_ENV_STATE not in self.input_features and not self.image_features:
             logging.warning("There is no %s: the planner does not see where the objects are", OBS_ENV_STATE)
         if self.observation_token_sizes is None:
@@ -291,11 +304,10 @@ class HDPConfig(PreTrainedConfig):
         if self.symbol_process is not None:
             self._set_symbols(features)
 
-    def unused_cameras(self, cameras: Iterable[str]) -> list[str]:
-        """Those of a dataset's cameras that are not observed."""
-        if not self.takes_images:
-            return list(cameras)
-        return [key for key in cameras if self.input_features and key not in self.input_features]
+    def observes_camera(self, key: str, feature: PolicyFeature) -> bool:
+        """Whether the planner takes a camera of a dataset, by its name and its shape (channels, height, width)."""
+        is_chosen = not self.input_features or key in self.input_features
+        return self.takes_images and is_chosen and key.startswith(OBS_PREFIX) and feature.shape[0] == RGB
 
     def _token_sizes(self, features: dict[str, dict]) -> list[int]:
         """Sizes of the condition tokens, see `object_tokens`."""
@@ -342,8 +354,8 @@ class HDPConfig(PreTrainedConfig):
             height, width = self.resize_shape or feature.shape[1:]
             if min(height, width) <= BACKBONE_STRIDE:
                 raise ValueError(
-                    f"{key} has {height} x {width} pixels, of which the image encoder sees one cell: record more than "
-                    f"{BACKBONE_STRIDE} either way, or enlarge the images with --policy.resize_shape"
+                    f"{key} has {height} x {width} pixels, of which the image encoder sees one row or column of cells: "
+                    f"record more than {BACKBONE_STRIDE} either way, or enlarge them with --policy.resize_shape"
                 )
         symbols_known = self.vocabulary is not None and self.symbolic_horizon is not None
         if self.observation_token_sizes is None or (self.symbol_process is not None and not symbols_known):
@@ -387,6 +399,16 @@ class HDPConfig(PreTrainedConfig):
 
     def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+
+def _check_shapes(chosen: dict[str, PolicyFeature], known: dict[str, PolicyFeature]) -> None:
+    """Refuse observations that a user chose and a dataset, whose columns are known, does not have."""
+    known = {key: feature for key, feature in known.items() if key.startswith(OBS_PREFIX) and key != OBS_SYMBOLIC_PLAN}
+    for key, feature in chosen.items():
+        if key not in known:
+            raise ValueError(f"input_features names {key}, which the dataset does not have; it has {', '.join(known)}")
+        if tuple(feature.shape) != tuple(known[key].shape):
+            raise ValueError(f"input_features says {key} has shape {feature.shape}, the dataset {known[key].shape}")
 
 
 def _check_choice(name: str, value: Any, choices: Sequence[str]) -> None:

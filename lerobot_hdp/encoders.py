@@ -62,41 +62,29 @@ class ImageEncoder(nn.Module):
     """Features of the observed images, by LeRobot's encoder of Diffusion Policy, one for each camera.
 
     A ResNet whose last feature maps are read as keypoints: of each, where in the image it is most active (spatial
-    softmax; Finn et al. 2016, "Deep Spatial Autoencoders for Visuomotor Learning"). A new one has group normalisation;
-    a pretrained one keeps the batch statistics that it comes with, since an average of weights has none of its own.
+    softmax; Finn et al. 2016, "Deep Spatial Autoencoders for Visuomotor Learning").
 
     Args:
         cameras: names of the observed images, and their shapes (3, height, width).
-        vision_backbone: a ResNet of torchvision.
-        pretrained_backbone_weights: the name of its weights there; None: it is a new one.
+        group_norm: True for ResNets that are trained from scratch; False for pretrained ones, whose batch statistics
+            stay as they are, since an average of weights has none of its own.
         options: more of `DiffusionConfig`.
     """
 
-    def __init__(
-        self,
-        cameras: Mapping[str, PolicyFeature],
-        vision_backbone: str,
-        pretrained_backbone_weights: str | None,
-        **options: Any,
-    ):
+    def __init__(self, cameras: Mapping[str, PolicyFeature], group_norm: bool, **options: Any):
         super().__init__()
         self.cameras = list(cameras)
-        self.encoders = nn.ModuleList()
-        for name, camera in cameras.items():
-            config = DiffusionConfig(
-                input_features={name: camera},
-                vision_backbone=vision_backbone,
-                pretrained_backbone_weights=pretrained_backbone_weights,
-                use_group_norm=pretrained_backbone_weights is None,
-                device="cpu",
-                **options,
-            )
-            encoder = DiffusionRgbEncoder(config)
-            if pretrained_backbone_weights is not None:
-                # To learn the size of its feature maps, it was shown a black image, which moved the batch statistics.
-                backbone = get_model(vision_backbone, weights=pretrained_backbone_weights)
-                encoder.backbone.load_state_dict(nn.Sequential(*list(backbone.children())[:-2]).state_dict())
-            self.encoders.append(encoder)
+        options |= {"use_group_norm": group_norm, "pretrained_backbone_weights": None, "device": "cpu"}
+        self.encoders = nn.ModuleList(
+            DiffusionRgbEncoder(DiffusionConfig(input_features={name: camera}, **options))
+            for name, camera in cameras.items()
+        )
+
+    def load_backbones(self, vision_backbone: str, weights: str) -> None:
+        """Start from torchvision's weights, which are downloaded if they were not before."""
+        layers = list(get_model(vision_backbone, weights=weights).children())
+        for encoder in self.encoders:
+            encoder.backbone.load_state_dict(nn.Sequential(*layers[:-2]).state_dict())
 
     def train(self, mode: bool = True) -> "ImageEncoder":
         """Batch statistics stay as they are."""
@@ -112,7 +100,7 @@ class ImageEncoder(nn.Module):
 
 
 def image_feature_size(num_keypoints: int) -> int:
-    """Numbers that an image becomes: two coordinates of each keypoint, mixed by a linear layer."""
+    """Numbers that an image becomes: two coordinates of each keypoint, through a linear layer and a ReLU."""
     return 2 * num_keypoints
 
 

@@ -31,6 +31,9 @@ from .prompt import place_prompts
 from .sampling import Denoise, DenoisingState, sample_plan
 from .vocabulary import PAD_ID, Vocabulary
 
+CONDITION = "condition_tokens"
+"""Where a batch holds its encoded observations, (B, n, width), while a plan is made from it."""
+
 
 def _without_dropout[**P, R](method: Callable[P, R]) -> Callable[P, R]:
     """Let a method of a policy plan without dropout, also in the middle of the policy's training."""
@@ -64,8 +67,8 @@ class Planner(nn.Module):
         if config.image_features:
             self.image_encoder = ImageEncoder(
                 config.image_features,
-                config.vision_backbone,
-                config.pretrained_backbone_weights,
+                group_norm=config.pretrained_backbone_weights is None,
+                vision_backbone=config.vision_backbone,
                 spatial_softmax_num_keypoints=config.spatial_softmax_num_keypoints,
                 resize_shape=config.resize_shape,
             )
@@ -94,11 +97,6 @@ class Planner(nn.Module):
     def denoisers(self) -> list[Denoiser]:
         return [self.denoiser]
 
-    @property
-    def backbone(self) -> list[nn.Parameter]:
-        """What is trained at `optimizer_lr_backbone`."""
-        return [] if self.image_encoder is None else list(self.image_encoder.parameters())
-
 
 class HDPPolicy(PreTrainedPolicy):
     """Hybrid Diffusion Planner (Høeg et al. 2026): denoises a motion and the symbolic plan behind it at once.
@@ -110,7 +108,8 @@ class HDPPolicy(PreTrainedPolicy):
         dataset_stats: of the dataset that the policy is to be trained on; see `widen_narrow_ranges`. LeRobot makes the
             normaliser of the same ones afterwards, in fine-tuning too.
         dataset_meta: metadata of the dataset that the policy is to be trained on; its episodes are checked against
-            the horizon.
+            the horizon. With it, a new policy's image encoders start from `pretrained_backbone_weights`; a checkpoint
+            has weights of its own.
     """
 
     config_class = HDPConfig
@@ -130,6 +129,9 @@ class HDPPolicy(PreTrainedPolicy):
         self.motion_process, self.symbol_process = make_processes(config)
 
         self.planner = self._make_planner()
+        is_new = dataset_meta is not None and config.pretrained_path is None
+        if is_new and config.pretrained_backbone_weights and self.planner.image_encoder is not None:
+            self.planner.image_encoder.load_backbones(config.vision_backbone, config.pretrained_backbone_weights)
         averages = config.ema_max_decay > 0
         self.ema = MovingAverage(self.planner, config.ema_power, config.ema_max_decay) if averages else None
         if config.compile_model:
@@ -149,7 +151,9 @@ class HDPPolicy(PreTrainedPolicy):
     def get_optim_params(self) -> list[dict]:
         matrices = [matrix for denoiser in self.planner.denoisers for matrix in denoiser.hidden_matrices]
         for_muon = matrices if self.config.optimizer_type == "muon" else ()
-        return parameter_groups(self.planner, for_muon, self.planner.backbone, self.config.optimizer_lr_backbone)
+        image_encoder = self.planner.image_encoder
+        of_images = image_encoder.parameters() if image_encoder is not None else ()
+        return parameter_groups(self.planner, for_muon, of_images, self.config.optimizer_lr_backbone)
 
     def reset(self) -> None:
         """Forget the plan in execution. To be called on `env.reset()`."""
@@ -295,6 +299,8 @@ class HDPPolicy(PreTrainedPolicy):
             ValueError: an observation with NaN or infinity, a prompt that does not fit, or a checker with nothing to
                 choose from.
         """
+        self._check_observations(batch)
+        batch = self._encode_once(batch)
         k = num_candidates
         if k is None:
             partial = isinstance(prompt, PlanPrompt) and prompt.gives_part_of_motion and self.can_score
@@ -306,7 +312,7 @@ class HDPPolicy(PreTrainedPolicy):
                 raise ValueError("a checker chooses among candidates: set num_candidates to more than 1")
             return self._sample(batch, self.read_prompt(batch, prompt, generator), generator, on_step)
 
-        inputs = [key for key in (*self.config.input_features, OBS_SYMBOLIC_PLAN) if key in batch]
+        inputs = [key for key in (*self.config.input_features, OBS_SYMBOLIC_PLAN, CONDITION) if key in batch]
         repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in inputs}
         if isinstance(prompt, PlanPrompt):
             prompt.check(self._motion_shape(batch), self.config.symbolic_horizon, self.vocabulary)
@@ -360,11 +366,7 @@ class HDPPolicy(PreTrainedPolicy):
         Raises:
             ValueError: an observation that is missing or holds NaN or infinity, or a prompt that does not fit.
         """
-        for key in self.config.input_features:
-            if key not in batch:
-                raise ValueError(f"the planner was trained on {key}, which is not observed here")
-            if not torch.isfinite(batch[key]).all():
-                raise ValueError(f"{key} holds NaN or infinity: no plan can be made from it")
+        self._check_observations(batch)
         if prompt is None and self.config.prompt:
             prompt = self.config.prompt
         if prompt is None and OBS_SYMBOLIC_PLAN in batch and self.symbol_process is not None:
@@ -381,6 +383,17 @@ class HDPPolicy(PreTrainedPolicy):
         prompt = prompt.to(self._device)
         prompt.check(self._motion_shape(batch), self.config.symbolic_horizon, self.vocabulary)
         return prompt
+
+    def _check_observations(self, batch: dict[str, Tensor]) -> None:
+        for key in self.config.input_features:
+            if key not in batch:
+                raise ValueError(f"the planner was trained on {key}, which is not observed here")
+            if not torch.isfinite(batch[key]).all():
+                raise ValueError(f"{key} holds NaN or infinity: no plan can be made from it")
+
+    def _encode_once(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A batch with its condition tokens, for all that is asked of the denoiser about one plan."""
+        return {**batch, CONDITION: self._planning_network.encode(batch)}
 
     def _ask_for_symbols(self, batch: dict[str, Tensor], generator: Generator | None, given: Tensor) -> Tensor:
         """Scores of all symbols where a plan begins, pure noise and masks, beside what is given: (B, H_d, m).
@@ -427,7 +440,7 @@ class HDPPolicy(PreTrainedPolicy):
     def _denoiser(self, batch: dict[str, Tensor]) -> Denoise:
         """The denoiser for the observations of a batch."""
         network = self._planning_network
-        observation = network.encode(batch)
+        observation = batch[CONDITION] if CONDITION in batch else network.encode(batch)
 
         def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
             with self._autocast():

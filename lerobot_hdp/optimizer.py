@@ -109,7 +109,7 @@ def _stay_fused(optimizer: Optimizer, fused: bool) -> None:
 def parameter_groups(
     network: nn.Module,
     hidden_matrices: Iterable[nn.Parameter],
-    backbone: Iterable[nn.Parameter] = (),
+    image_encoder: Iterable[nn.Parameter] = (),
     lr_backbone: float = 0.0,
 ) -> list[dict[str, Any]]:
     """Parameters of a network for an optimizer: Muon's, others with weight decay (matrices), and those without.
@@ -117,16 +117,16 @@ def parameter_groups(
     Args:
         network: to be trained.
         hidden_matrices: those of its parameters that Muon is to update; AdamW updates all, if there are none.
-        backbone: those with a learning rate of their own, `lr_backbone`, and without weight decay.
+        image_encoder: those with a learning rate of their own, `lr_backbone`, and without weight decay.
     """
-    for_muon, slow = list(hidden_matrices), list(backbone)
-    taken = {id(parameter) for parameter in (*for_muon, *slow)}
+    for_muon, of_images = list(hidden_matrices), list(image_encoder)
+    taken = {id(parameter) for parameter in (*for_muon, *of_images)}
     others = [parameter for parameter in network.parameters() if id(parameter) not in taken]
     decay = [parameter for parameter in others if parameter.ndim == 2]
     no_decay = [parameter for parameter in others if parameter.ndim != 2]
     groups: list[dict[str, Any]] = [{"params": decay}, {"params": no_decay, "weight_decay": 0.0}]
     if for_muon:
         groups.insert(0, {"params": for_muon, FOR_MUON: True})
-    if slow:
-        groups.append({"params": slow, "weight_decay": 0.0, "lr": lr_backbone})
+    if of_images:
+        groups.append({"params": of_images, "weight_decay": 0.0, "lr": lr_backbone})
     return groups

@@ -29,20 +29,22 @@ class ObservationShapesProcessorStep(ObservationProcessorStep):
     """Refuse observations that are not those that the planner was trained on.
 
     Attributes:
-        shapes: of each observation. LeRobot stores what has one component as a number, of which nothing is said here.
+        shapes: of each observation; None is any size. LeRobot stores what has one component as a number, of which
+            nothing is said here.
 
     Raises:
         ValueError: an observation is missing or has another shape.
     """
 
-    shapes: dict[str, list[int]] = field(default_factory=dict)
+    shapes: dict[str, list[int | None]] = field(default_factory=dict)
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         for key, shape in self.shapes.items():
             if key not in observation:
                 raise ValueError(f"the planner was trained on {key}, which is not observed here")
             found = list(observation[key].shape[-len(shape) :])
-            if shape != [1] and found != shape:
+            fits = all(wanted in (None, size) for wanted, size in zip(shape, found, strict=False))
+            if shape != [1] and not (fits and len(found) == len(shape)):
                 raise ValueError(f"the planner was trained on {key} of shape {shape}, here it has {found}")
         return observation
 
@@ -112,14 +114,21 @@ def make_hdp_pre_post_processors(
     """LeRobot's default processors, after a look at the observations, and the symbolic plan as token ids."""
     widen_narrow_ranges(config, dataset_stats or {})
     steps = make_default_policy_processor_steps(config, dataset_stats)
-    shapes = ObservationShapesProcessorStep({key: list(value.shape) for key, value in config.input_features.items()})
+    shapes = {key: list(feature.shape) for key, feature in config.input_features.items()}
+    if config.resize_shape is not None:
+        shapes |= {key: [feature.shape[0], None, None] for key, feature in config.image_features.items()}
     symbolic_plan = SymbolicPlanProcessorStep(
         symbolic_horizon=config.symbolic_horizon if config.symbol_process else None,
         vocabulary_size=len(config.vocabulary or []),
     )
     return make_policy_processor_pipelines(
         input_steps=[
-            steps.rename_observations, steps.add_batch_dim, shapes, symbolic_plan, steps.to_device, steps.normalize
+            steps.rename_observations,
+            steps.add_batch_dim,
+            ObservationShapesProcessorStep(shapes),
+            symbolic_plan,
+            steps.to_device,
+            steps.normalize,
         ],
         output_steps=[steps.unnormalize, steps.to_cpu],
     )  # fmt: skip

@@ -165,9 +165,10 @@ def open_datasets(monkeypatch):
     for name in ("make_train_eval_datasets", "lerobot_collate_fn", "save_checkpoint"):
         monkeypatch.setattr(lerobot_train, name, getattr(lerobot_train, name))
 
-    def open_(root, max_gib=1.0, policy=None, **kwargs):
+    def open_(root, max_gib=1.0, policy=None, rename_map=None, **kwargs):
         dataset = DatasetConfig("test/dataset", root=str(root), video_backend="pyav", **kwargs)
         config = TrainPipelineConfig(dataset, policy=policy or ACTConfig(device="cpu"), num_workers=3)
+        config.rename_map = rename_map or {}
         hdp_train.hold_datasets_in_memory(max_gib)
         return lerobot_train.make_train_eval_datasets(config), config.num_workers
 
@@ -211,6 +212,15 @@ def test_planners_of_whole_episodes_hold_first_images_alone(camera_root, open_da
     (dataset, _), _ = open_datasets(camera_root, policy=planner)
     [batch] = dataset.__getitems__([1])
     assert torch.equal(batch["observation.images.wrist"][0], whole[1]["observation.images.wrist"])
+
+
+def test_a_camera_is_known_by_its_new_name(camera_root, open_datasets):
+    planner = HDPConfig(horizon=3, device="cpu", pretrained_path="some/checkpoint")
+    planner.input_features = {"observation.images.top": PolicyFeature(FeatureType.VISUAL, (3, 32, 48))}
+    renamed = {"observation.images.front": "observation.images.top"}
+    (dataset, _), _ = open_datasets(camera_root, policy=planner, rename_map=renamed)
+    [batch] = dataset.__getitems__([0])
+    assert [key for key in batch if "images" in key] == ["observation.images.front"]
 
 
 @pytest.mark.parametrize(("share", "held"), [(1.1, True), (0.75, False)])

@@ -5,10 +5,11 @@ import json
 import pytest
 import torch
 from draccus.utils import ParsingError
-from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.scripts import lerobot_eval, lerobot_train
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from safetensors.torch import load_file
 from torch.utils.data import default_collate
 from torchvision.models import resnet18
@@ -62,7 +63,8 @@ def runs(dataset, tmp_path_factory):
             *("--policy.type=hdp", *(f"--policy.{name}={value}" for name, value in TINY.items())),
             *("--policy.device=cpu", "--policy.push_to_hub=false", f"--output_dir={folders[-1]}"),
             *("--dataset.repo_id=test/images", f"--dataset.root={dataset.root}", "--dataset.video_backend=pyav"),
-            *(*TASK_FLAGS, f"--steps={STEPS}", "--batch_size=3", "--num_workers=0", "--env_eval_freq=0"),
+            *(*TASK_FLAGS, f"--steps={STEPS}", "--batch_size=2", "--num_workers=0", "--env_eval_freq=0"),
+            *("--dataset.eval_split=0.3", "--eval_steps=3"),
         )
     return folders
 
@@ -119,26 +121,51 @@ def test_a_saved_planner_makes_the_same_plans(make_planner, tmp_path):
     assert torch.equal(plans[0].actions, plans[1].actions)
 
 
-def test_each_camera_is_a_condition_token_of_its_own(dataset, make_planner):
-    assert make_planner()[0].config.observation_token_sizes == [64]
-    chosen = {
-        "observation.state": PolicyFeature(FeatureType.STATE, (4,)),
-        FRONT: PolicyFeature(FeatureType.VISUAL, (3, 48, 64)),
-        WRIST: PolicyFeature(FeatureType.VISUAL, (3, 40, 40)),
-    }
-    policy = make_policy(HDPConfig(**TINY, input_features=chosen, device="cpu"), ds_meta=dataset.meta)
-    assert policy.config.observation_token_sizes == [4, 64, 64]
-    batch = {key: torch.rand(2, *feature.shape) for key, feature in chosen.items()}
+def test_each_camera_is_a_condition_token_of_its_own(dataset):
+    camera = {"dtype": "video", "shape": (40, 40, 3), "names": ["height", "width", "channels"]}
+    depth = {**camera, "shape": (40, 40, 1)}
+    config = HDPConfig(**TINY, device="cpu")
+    features = {**dataset.meta.features, WRIST: camera, "observation.images.depth": depth, "preview": camera}
+    known = dataset_to_policy_features(features)
+    config.output_features = {"action": known.pop("action")}
+    config.input_features = known
+    config.set_dataset_feature_metadata(features)
+    assert list(config.input_features) == [FRONT, WRIST]
+    assert config.observation_token_sizes == [64, 64]
+    policy = HDPPolicy(config)
+    batch = {key: torch.rand(2, *feature.shape) for key, feature in config.input_features.items()}
     tokens = policy.planner.encode(batch)
-    for position, camera in ((1, FRONT), (2, WRIST)):
+    for position, camera in enumerate((FRONT, WRIST)):
         changed = policy.planner.encode({**batch, camera: torch.rand_like(batch[camera])})
-        assert [torch.equal(changed[:, i], tokens[:, i]) for i in range(3)] == [i != position for i in range(3)]
+        assert [torch.equal(changed[:, i], tokens[:, i]) for i in range(2)] == [i != position for i in range(2)]
 
 
-def test_images_can_be_resized(make_planner):
-    small, batch = make_planner(resize_shape=(40, 70))
-    assert small.plan(batch, "").actions.shape == (4, 25, 4)
-    assert small.planner.image_encoder.encoders[0].pool.pos_grid.shape == (6, 2)  # x, y of two by three cells
+def test_images_are_encoded_once_for_all_candidates(make_planner):
+    policy, batch = make_planner()
+    seen = []
+    encoder = policy.ema.module.image_encoder
+    encoder.register_forward_hook(lambda module, inputs, outputs: seen.append(len(inputs[0][FRONT])))
+    candidates = policy.plan(batch, "... S1", num_candidates=5)
+    assert seen == [4]
+    assert candidates.scores.shape == (4,)
+    plan = policy.plan({FRONT: batch[FRONT]}, "", torch.Generator().manual_seed(0))
+    again = policy.plan({FRONT: batch[FRONT]}, "", torch.Generator().manual_seed(0))
+    assert torch.equal(plan.actions, again.actions)
+    assert seen == [4, 4, 4]
+
+
+def test_images_of_any_size_are_resized(dataset):
+    config = HDPConfig(**TINY, resize_shape=(48, 64), device="cpu")
+    policy = make_policy(config, ds_meta=dataset.meta)
+    preprocessor, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    image = dataset[0][FRONT][None]
+    larger = image.repeat_interleave(4, dim=-1).repeat_interleave(4, dim=-2)
+    tokens, others, of_larger = (
+        policy.planner.encode(preprocessor({FRONT: images})) for images in (image, image.flip(-1), larger)
+    )
+    assert (of_larger - tokens).norm() < 0.5 * (others - tokens).norm()
+    with pytest.raises(ValueError, match="here it has"):
+        preprocessor({FRONT: image[:, :1]})
 
 
 def test_pretrained_weights_keep_their_batch_statistics(make_planner, tmp_path, monkeypatch):
@@ -154,6 +181,11 @@ def test_pretrained_weights_keep_their_batch_statistics(make_planner, tmp_path, 
     train_in_process(policy, batch, steps=2)
     assert not torch.equal(backbone[0].weight, weights["conv1.weight"])
     assert torch.equal(backbone[1].running_mean, weights["bn1.running_mean"])
+
+    policy.save_pretrained(tmp_path / "checkpoint")
+    (tmp_path / "hub/checkpoints/resnet18-f37072fd.pth").unlink()  # a checkpoint needs it no more
+    loaded = HDPPolicy.from_pretrained(tmp_path / "checkpoint")
+    assert torch.equal(loaded.planner.encode(batch), policy.eval().planner.encode(batch))
 
 
 def test_hierarchical_planners_take_no_images(dataset, caplog):
@@ -173,6 +205,10 @@ def test_images_of_one_cell_are_refused(make_planner):
     ("options", "message"),
     [
         ({"vision_backbone": "vgg16"}, "vision_backbone must be one of"),
+        (
+            {"pretrained_backbone_weights": "ResNet34_Weights.DEFAULT"},
+            "must be one of .'ResNet18_Weights.IMAGENET1K_V1'",
+        ),
         ({"resize_shape": (0, 32)}, "resize_shape is a height and a width of at least 1"),
         ({"spatial_softmax_num_keypoints": 0}, "spatial_softmax_num_keypoints must be at least 1"),
     ],

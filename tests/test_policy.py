@@ -280,6 +280,27 @@ def test_any_frame_trains_on_what_remains(make_planner, dataset):
         assert sum(parts[name] for parts in history[-10:]) < 0.7 * sum(parts[name] for parts in history[:10])
 
 
+def test_a_planner_that_sees_no_objects_says_so(dataset, caplog):
+    chosen = {"observation.state": PolicyFeature(FeatureType.STATE, (3,))}
+    config = HDPConfig(**TINY_PLANNER, input_features=chosen, device="cpu")
+    config.set_dataset_feature_metadata(dataset.meta.features)
+    assert config.observation_token_sizes == [3]
+    assert "the planner does not see where the objects are" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "message"),
+    [
+        ("observation.state", 7, r"says observation.state has shape \(7,\), the dataset \(3,\)"),
+        ("observation.force", 3, "names observation.force, which the dataset does not have; it has observation\\."),
+    ],
+)
+def test_chosen_observations_are_those_of_the_dataset(dataset, name, size, message):
+    chosen = {name: PolicyFeature(FeatureType.STATE, (size,))}
+    with pytest.raises(ValueError, match=message):
+        make_policy(HDPConfig(**TINY_PLANNER, input_features=chosen, device="cpu"), ds_meta=dataset.meta)
+
+
 def test_an_open_prompt_stays_open_where_it_is_filled(make_planner, batch):
     """An environment may know a shorter plan than the planner makes."""
     policy, preprocessor, _ = make_planner(symbolic_horizon=24)

@@ -22,6 +22,8 @@ from .configuration_hierarchical import CoupledHierarchicalDiffuserConfig, Hiera
 class HierarchicalPlanner(nn.Module):
     """Two denoisers, of sub-goals and of segments, and the encoders of what each is conditioned on."""
 
+    image_encoder = None
+
     def __init__(self, config: HierarchicalDiffuserConfig):
         super().__init__()
         observed = config.observation_token_sizes
@@ -88,10 +90,6 @@ class HierarchicalPlanner(nn.Module):
     def denoisers(self) -> list[Denoiser]:
         return [self.high, self.low]
 
-    @property
-    def backbone(self) -> list[nn.Parameter]:
-        return []
-
 
 class HierarchicalDiffuserPolicy(HDPPolicy):
     """Plans sub-goals, then the segments between them."""
@@ -102,6 +100,10 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
 
     def _make_planner(self) -> HierarchicalPlanner:
         return HierarchicalPlanner(self.config)
+
+    def _encode_once(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """As it is: each level has encoders of its own, of what it is conditioned on."""
+        return batch
 
     def _states(self, batch: dict[str, Tensor]) -> Tensor:
         """What is observed now and, in training, the sub-goals: (B, 1 or 1 + M, S)."""

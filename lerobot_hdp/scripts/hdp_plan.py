@@ -9,7 +9,7 @@ import json
 import logging
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import indent
 from typing import Any, NamedTuple
@@ -157,8 +157,8 @@ def make_plan(config: PlanConfig) -> Result:
         raise ValueError("--check=true chooses among candidates: set --policy.num_candidates to more than 1")
     if config.check and policy.vocabulary is None:
         raise ValueError("--check=true: this planner models no symbols, so there is no plan to check")
-    if getattr(config.env, "obs_type", None) == "pixels":
-        config.env = replace(config.env, obs_type="pixels_state")  # the checker looks at the objects' poses
+    if hasattr(config.env, "with_poses"):
+        config.env = config.env.with_poses()
     env_preprocessor, _ = make_env_pre_post_processors(config.env, config.policy)
     task = getattr(config.env, "planning_task", None)
     if task is not None:

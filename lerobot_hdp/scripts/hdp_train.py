@@ -23,10 +23,12 @@ from typing import Any
 import datasets
 import numpy as np
 import torch
+from lerobot.configs import FeatureType
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
 from lerobot.utils.collate import lerobot_collate_fn
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch.distributed import ProcessGroup
 from torch.utils.data import Dataset, Subset
 
@@ -50,8 +52,7 @@ def hold_datasets_in_memory(max_gib: float) -> None:
         users_num_workers = cfg.num_workers
         train_and_eval = make_datasets(cfg)
         opened = [dataset for dataset in train_and_eval if dataset is not None]
-        is_planner = isinstance(cfg.policy, HDPConfig)
-        leave_out = cfg.policy.unused_cameras(opened[0].meta.camera_keys) if is_planner else []
+        leave_out = _unused_cameras(cfg, opened[0].meta.features) if isinstance(cfg.policy, HDPConfig) else []
         first_images_only = _plans_whole_episodes(cfg)
         if (reason := _why_not_in_memory(opened, leave_out, first_images_only, max_gib)) is not None:
             logging.warning("The dataset is read item by item, as by lerobot-train: %s", reason)
@@ -137,6 +138,12 @@ def hold_process_group() -> list[ProcessGroup]:
 def _plans_whole_episodes(cfg: TrainPipelineConfig) -> bool:
     """Whether the policy is trained on the first frames of episodes alone."""
     return isinstance(cfg.policy, HDPConfig) and cfg.policy.plan_from == "episode_start"
+
+
+def _unused_cameras(cfg: TrainPipelineConfig, features: dict[str, dict]) -> list[str]:
+    """Cameras of a dataset, by its own names, that a planner does not observe."""
+    cameras = [item for item in dataset_to_policy_features(features).items() if item[1].type is FeatureType.VISUAL]
+    return [key for key, camera in cameras if not cfg.policy.observes_camera(cfg.rename_map.get(key, key), camera)]
 
 
 def _why_not_in_memory(
