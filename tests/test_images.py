@@ -113,6 +113,17 @@ def test_what_an_image_shows_is_learned(make_planner):
     assert wrong > 2 * right
 
 
+@pytest.mark.parametrize("optimizer", ["muon", "adamw"])
+def test_image_encoders_have_a_learning_rate_of_their_own(make_planner, optimizer):
+    policy, _ = make_planner(optimizer_type=optimizer)
+    groups = policy.config.get_optimizer_preset().build(policy.get_optim_params()).param_groups
+    rates = {id(parameter): group["lr"] for group in groups for parameter in group["params"]}
+    trained = dict(policy.planner.named_parameters())
+    assert len(rates) == len(trained)
+    for name, parameter in trained.items():
+        assert rates[id(parameter)] == (1e-4 if name.startswith("image_encoder") else 3e-3)
+
+
 def test_a_saved_planner_makes_the_same_plans(make_planner, tmp_path):
     policy, batch = make_planner()
     policy.save_pretrained(tmp_path)
