@@ -126,7 +126,7 @@ def draw_candidates(subject: Subject, number: int) -> Candidates:
     success, scores, complaints = [], [], []
     torch.manual_seed(0)
     for i, seed in enumerate(subject.seeds):
-        inputs = {key: value[i : i + 1].expand(number, -1) for key, value in subject.inputs.items()}
+        inputs = {key: value[i : i + 1].repeat_interleave(number, dim=0) for key, value in subject.inputs.items()}
         plan = subject.policy.plan(inputs, num_candidates=1)
         scores.append(subject.policy.score(inputs, plan).cpu())
         complaints.append([len(task.check_plan(plan.symbols(j), subject.observations[i])) for j in range(number)])

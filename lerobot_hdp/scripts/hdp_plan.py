@@ -158,7 +158,7 @@ def make_plan(config: PlanConfig) -> Result:
     if config.check and policy.vocabulary is None:
         raise ValueError("--check=true: this planner models no symbols, so there is no plan to check")
     if hasattr(config.env, "with_poses"):
-        config.env = config.env.with_poses()
+        config.env = config.env.with_poses()  # for the task's checker of plans; a planner that sees takes no notice
     env_preprocessor, _ = make_env_pre_post_processors(config.env, config.policy)
     task = getattr(config.env, "planning_task", None)
     if task is not None:
