@@ -258,6 +258,12 @@ def test_an_epoch_of_the_papers_sees_each_demonstration_once():
     assert cell.samples == 5_000 * 200
 
 
+def test_planners_that_take_no_images_have_no_cells_of_them():
+    cells = make_cells(["small", "paper"], ["xarm_sorting_images"], list(METHODS), [0])
+    assert sorted({cell.policy["type"] for cell in cells}) == sorted(set(METHODS) - set(HIERARCHICAL))
+    assert {cell.dataset_root.name for cell in cells} == {"XArmSorting_obs_type_pixels_camera_names_front_200_episodes"}
+
+
 @pytest.mark.parametrize(
     ("preset", "task"),
     [("mini", "block_sorting_2d_2_blocks"), ("mini", "block_sorting_2d_4_blocks"), ("default", "xarm_tool_use")],
