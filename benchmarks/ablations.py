@@ -149,7 +149,7 @@ def variant_of(name: str, task: str, seed: int) -> Cell:
         cell,
         group="ablations",
         name=f"{task}_{name.replace(', ', '_').replace('/', '_')}_seed{seed}",
-        policy=complete({**cell.policy, **changes}),
+        policy=complete({**cell.policy, **changes}, cell.env),
         facts={"variant": name},
     )
 

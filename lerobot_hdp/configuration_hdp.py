@@ -138,9 +138,9 @@ class HDPConfig(PreTrainedConfig):
         optimizer_*, scheduler_*: of these, with a linear warm-up and a cosine decay to the last step. The preset's
             learning rate is one for the network that is the default; smaller ones, as in `configs/`, learn faster with
             3e-3, which was too much for it in arranging (docs/tasks/xarm_arrange_blocks.md).
-            `optimizer_lr_backbone`: of the images' encoder, updated by AdamW (at a higher one, all images soon looked
-            alike to it). `optimizer_betas`, `optimizer_eps`: of AdamW; `optimizer_momentum`: of Muon;
-            `optimizer_fused`: AdamW updates all parameters in one kernel; None: on CUDA.
+            `optimizer_lr_backbone`: of the images' encoders, updated by AdamW, whose `optimizer_betas` and
+            `optimizer_eps` are; `optimizer_momentum`: of Muon; `optimizer_fused`: AdamW updates all parameters in one
+            kernel; None: on CUDA.
 
     Raises:
         ParsingError: a value that cannot be. It is draccus' own error, because LeRobot's commands hide the message of
@@ -294,7 +294,7 @@ class HDPConfig(PreTrainedConfig):
                 logging.warning("%s is left out: a planner of type %s takes no %s", key, self.type, what)
                 del self.input_features[key]
         if self.pretrained_path is None:
-            _check_shapes(self.input_features, dataset_to_policy_features(features))
+            _check_chosen(self.input_features, dataset_to_policy_features(features))
         if self.image_features:
             logging.info("Observed through a %s each: %s", self.vision_backbone, ", ".join(self.image_features))
         if OBS_ENV_STATE not in self.input_features and not self.image_features:
@@ -355,7 +355,8 @@ class HDPConfig(PreTrainedConfig):
             if min(height, width) <= BACKBONE_STRIDE:
                 raise ValueError(
                     f"{key} has {height} x {width} pixels, of which the image encoder sees one row or column of cells: "
-                    f"record more than {BACKBONE_STRIDE} either way, or enlarge them with --policy.resize_shape"
+                    f"record more than {BACKBONE_STRIDE} either way, enlarge them with --policy.resize_shape, or "
+                    "observe something else with --policy.input_features"
                 )
         symbols_known = self.vocabulary is not None and self.symbolic_horizon is not None
         if self.observation_token_sizes is None or (self.symbol_process is not None and not symbols_known):
@@ -401,14 +402,15 @@ class HDPConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
 
-def _check_shapes(chosen: dict[str, PolicyFeature], known: dict[str, PolicyFeature]) -> None:
+def _check_chosen(chosen: dict[str, PolicyFeature], known: dict[str, PolicyFeature]) -> None:
     """Refuse observations that a user chose and a dataset, whose columns are known, does not have."""
     known = {key: feature for key, feature in known.items() if key.startswith(OBS_PREFIX) and key != OBS_SYMBOLIC_PLAN}
     for key, feature in chosen.items():
         if key not in known:
             raise ValueError(f"input_features names {key}, which the dataset does not have; it has {', '.join(known)}")
-        if tuple(feature.shape) != tuple(known[key].shape):
-            raise ValueError(f"input_features says {key} has shape {feature.shape}, the dataset {known[key].shape}")
+        said, found = ((value.type.value, *value.shape) for value in (feature, known[key]))
+        if said != found:
+            raise ValueError(f"input_features says that {key} is {said}, in the dataset it is {found}")
 
 
 def _check_choice(name: str, value: Any, choices: Sequence[str]) -> None:

@@ -299,7 +299,6 @@ class HDPPolicy(PreTrainedPolicy):
             ValueError: an observation with NaN or infinity, a prompt that does not fit, or a checker with nothing to
                 choose from.
         """
-        self._check_observations(batch)
         batch = self._encode_once(batch)
         k = num_candidates
         if k is None:
@@ -312,8 +311,8 @@ class HDPPolicy(PreTrainedPolicy):
                 raise ValueError("a checker chooses among candidates: set num_candidates to more than 1")
             return self._sample(batch, self.read_prompt(batch, prompt, generator), generator, on_step)
 
-        inputs = [key for key in (*self.config.input_features, OBS_SYMBOLIC_PLAN, CONDITION) if key in batch]
-        repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in inputs}
+        asked = [key for key in (OBS_SYMBOLIC_PLAN, CONDITION) if key in batch]
+        repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in asked}
         if isinstance(prompt, PlanPrompt):
             prompt.check(self._motion_shape(batch), self.config.symbolic_horizon, self.vocabulary)
             prompt = prompt.repeat(k)
@@ -366,7 +365,8 @@ class HDPPolicy(PreTrainedPolicy):
         Raises:
             ValueError: an observation that is missing or holds NaN or infinity, or a prompt that does not fit.
         """
-        self._check_observations(batch)
+        if CONDITION not in batch:
+            self._check_observations(batch)
         if prompt is None and self.config.prompt:
             prompt = self.config.prompt
         if prompt is None and OBS_SYMBOLIC_PLAN in batch and self.symbol_process is not None:
@@ -393,6 +393,7 @@ class HDPPolicy(PreTrainedPolicy):
 
     def _encode_once(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """A batch with its condition tokens, for all that is asked of the denoiser about one plan."""
+        self._check_observations(batch)
         return {**batch, CONDITION: self._planning_network.encode(batch)}
 
     def _ask_for_symbols(self, batch: dict[str, Tensor], generator: Generator | None, given: Tensor) -> Tensor:
@@ -492,7 +493,7 @@ class HDPPolicy(PreTrainedPolicy):
         return [self._device] if self._device.type == "cuda" else []
 
     def _batch_size(self, batch: dict[str, Tensor]) -> int:
-        return len(batch[next(iter(self.config.input_features))])
+        return len(batch[CONDITION if CONDITION in batch else next(iter(self.config.input_features))])
 
     def _motion_shape(self, batch: dict[str, Tensor]) -> tuple[int, int, int]:
         """(B, H_c, D)."""

@@ -264,6 +264,12 @@ def test_planners_that_take_no_images_have_no_cells_of_them():
     assert {cell.dataset_root.name for cell in cells} == {"XArmSorting_obs_type_pixels_camera_names_front_200_episodes"}
 
 
+def test_cells_that_would_download_weights_are_not_packed(tmp_path):
+    with pytest.raises(ValueError, match="xarm_sorting_images_hdp_seed0"):
+        pack([make_cell("paper", "xarm_sorting_images", "hdp", 0)], tmp_path / "packed")
+    assert not (tmp_path / "packed").exists()
+
+
 @pytest.mark.parametrize(
     ("preset", "task"),
     [("mini", "block_sorting_2d_2_blocks"), ("mini", "block_sorting_2d_4_blocks"), ("default", "xarm_tool_use")],

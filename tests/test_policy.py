@@ -291,7 +291,8 @@ def test_a_planner_that_sees_no_objects_says_so(dataset, caplog):
 @pytest.mark.parametrize(
     ("name", "size", "message"),
     [
-        ("observation.state", 7, r"says observation.state has shape \(7,\), the dataset \(3,\)"),
+        ("observation.state", 7, r"says that observation.state is \('STATE', 7\), in the dataset it is \('STATE', 3\)"),
+        ("observation.environment_state", 4, "in the dataset it is .'ENV', 4"),
         ("observation.force", 3, "names observation.force, which the dataset does not have; it has observation\\."),
     ],
 )

@@ -38,8 +38,10 @@ def pack(cells: Sequence[Cell], folder: Path) -> None:
 
     Raises:
         FileExistsError: the folder is there already.
-        ValueError: the folder is larger than `MAX_MIB`.
+        ValueError: the folder is larger than `MAX_MIB`, or a cell begins with weights that are to be downloaded.
     """
+    if downloads := [cell.name for cell in cells if cell.policy.get("pretrained_backbone_weights")]:
+        raise ValueError(f"these cells begin with weights from the network, which cannot be packed: {downloads}")
     folder.mkdir(parents=True)
     tracked = ["git", "ls-files", "--cached", "--others", "--exclude-standard", *CODE]
     files = subprocess.run(tracked, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout.split()

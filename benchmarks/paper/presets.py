@@ -166,10 +166,18 @@ PRESETS: dict[str, Preset] = {
     ),
 }
 TASKS = tuple(ENVS)
+OF_IMAGES = (
+    "vision_backbone",
+    "pretrained_backbone_weights",
+    "spatial_softmax_num_keypoints",
+    "resize_shape",
+    "optimizer_lr_backbone",
+)
+"""Settings of a planner that mean something where it observes images."""
 
 
-def complete(policy: dict[str, Any]) -> dict[str, Any]:
-    """A policy's options, and the values that its preset fills, without those that mean nothing to it.
+def complete(policy: dict[str, Any], env: dict[str, Any]) -> dict[str, Any]:
+    """A policy's options, and the values that its preset fills, without those that mean nothing to it in a task.
 
     A cell says them all, so that its result is not taken for one of the preset as it is later.
     """
@@ -183,7 +191,7 @@ def complete(policy: dict[str, Any]) -> dict[str, Any]:
     filled = config(**options, device="cpu")
     if filled.sampler != "confidence":
         unused |= {"confidence_threshold"}
-    names = (*POLICY_PRESETS["default"], "confidence_threshold")
+    names = (*POLICY_PRESETS["default"], "confidence_threshold", *(OF_IMAGES if observes_images(env) else ()))
     values = {name: getattr(filled, name) for name in names if name not in unused}
     return {"type": policy["type"], **options, **values}
 
@@ -204,7 +212,7 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
         name=f"{task}_{method}_seed{seed}",
         env=ENVS[task],
         demonstrations=training.demonstrations,
-        policy=complete(policy),
+        policy=complete(policy, ENVS[task]),
         steps=training.steps,
         batch_size=training.batch_size,
         seed=seed,
@@ -215,9 +223,13 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
     )
 
 
+def observes_images(env: dict[str, Any]) -> bool:
+    return env.get("obs_type", "state") != "state"
+
+
 def exists(method: str, preset: str, task: str) -> bool:
     """Whether a preset has a task, and a method can do it."""
-    return task in PRESETS[preset].tasks and not (method in HIERARCHICAL and "obs_type" in ENVS[task])
+    return task in PRESETS[preset].tasks and not (method in HIERARCHICAL and observes_images(ENVS[task]))
 
 
 def stage(preset: str, method: str, task: str) -> int:

@@ -224,7 +224,8 @@ def explain(config: PlanConfig) -> str:
     features = dataset_to_policy_features(dataset.meta.features)
     for key, feature in {**policy.config.input_features, **policy.config.output_features}.items():
         shape = features[key].shape if key in features else None
-        if shape != feature.shape:
+        is_resized = policy.config.resize_shape is not None and key in policy.config.image_features
+        if shape is None or (shape != feature.shape and not is_resized):
             raise ValueError(f"the planner knows {key} of shape {feature.shape}, the dataset has {shape or 'none'}")
     if not 0 <= config.explain < dataset.num_episodes:
         raise ValueError(f"--explain={config.explain}: the dataset has the episodes 0 to {dataset.num_episodes - 1}")
