@@ -14,7 +14,7 @@ from ..cells import Cell
 METHODS = ("hdp", "diffuser", "joint_diffuser", "separate_diffuser", "hd", "chd")
 """Policy types, in the order in which they are worth running."""
 HIERARCHICAL = ("hd", "chd")
-"""Two networks each, so that their size is reported and not matched. They plan observations, but no images."""
+"""Two networks each, so that their size is reported and not matched."""
 ENVS: dict[str, dict[str, Any]] = {
     "xarm_sorting": {"task": "XArmSorting-v0"},
     "xarm_arrange_blocks": {"task": "XArmArrangeBlocks-v0"},
@@ -229,7 +229,8 @@ def observes_images(env: dict[str, Any]) -> bool:
 
 def exists(method: str, preset: str, task: str) -> bool:
     """Whether a preset has a task, and a method can do it."""
-    return task in PRESETS[preset].tasks and not (method in HIERARCHICAL and observes_images(ENVS[task]))
+    takes_images = PreTrainedConfig.get_choice_class(method).takes_images
+    return task in PRESETS[preset].tasks and (takes_images or not observes_images(ENVS[task]))
 
 
 def stage(preset: str, method: str, task: str) -> int:
