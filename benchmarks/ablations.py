@@ -82,6 +82,8 @@ EARLIER: dict[str, tuple[str, dict[str, Any]]] = {
 TODAYS: dict[str, tuple[str, dict[str, Any]]] = {
     "unchanged": ("small", {}),
     "lead_share=0": ("small", {"lead_share": 0.0}),
+    # HDP but for the symbols' process, whose loss has a scale of its own.
+    "type=separate_diffuser": ("small", {"type": "separate_diffuser", "symbol_loss_weight": 0.1}),
 }
 VARIANTS = {**EARLIER, **TODAYS}
 """For each variant a preset of the paper's tables and what is changed of it; with no change, it is a cell of these."""

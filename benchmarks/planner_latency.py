@@ -25,11 +25,13 @@ from lerobot_hdp.modeling_hdp import HDPPolicy
 from .cells import num_parameters
 from .machine import RESULTS, describe_run
 from .pages import DOCS, markdown_table
-from .paper.presets import ENVS, METHODS, PRESETS, make_cell
+from .paper.presets import ENVS, METHODS, PRESETS, make_cell, observes_images
 from .timing import compare
 
 FILES, PAGE = RESULTS / "planner_latency", DOCS / "planner_latency.md"
 REFERENCE = "diffuser"
+TASKS = [task for task in PRESETS["paper"].tasks if not observes_images(ENVS[task])]
+"""Those that all six planners can do."""
 
 
 def make_planner(policy_type: str, env: HDPEnv, **options) -> HDPPolicy:
@@ -98,7 +100,7 @@ def write_page() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=PRESETS["paper"].tasks, default="xarm_sorting")
+    parser.add_argument("--task", choices=TASKS, default="xarm_sorting")
     parser.add_argument("--batch_sizes", type=int, nargs="+", default=[1, 50])
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--num_inference_steps", type=int, default=5)
@@ -115,7 +117,7 @@ def main() -> None:
     planners = {}
     for name in METHODS:
         policy = make_cell("paper", options.task, name, seed=0).policy
-        planners[name] = make_planner(policy.pop("type"), env, **policy, **sizes)
+        planners[name] = make_planner(policy.pop("type"), env, **{**policy, **sizes})
 
     parameters = {name: num_parameters(policy) for name, policy in planners.items()}
     result = {

@@ -13,6 +13,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -150,8 +151,7 @@ class Shard(NamedTuple):
 def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
     """The environment's seed for an episode of a recording; a failed attempt is followed by another one.
 
-    Far from the small numbers that evaluations start from, so that no policy is evaluated on a start it was trained
-    on.
+    It may be any number below 2^32. The recordings and the evaluations of the benchmarks have none in common.
     """
     return int(np.random.SeedSequence([seed, episode, attempt]).generate_state(1)[0])
 
@@ -578,6 +578,10 @@ def main() -> None:
         _main()
     except KeyboardInterrupt:
         sys.exit("hdp-record: interrupted; go on with --resume=true")
+    except BrokenProcessPool:
+        sys.exit(
+            "hdp-record: a worker ended, for want of memory perhaps: go on with --resume=true and fewer --num_workers"
+        )
     except (ParsingError, ValueError, OSError, ImportError) as error:
         sys.exit(f"hdp-record: {error}")
 

@@ -84,8 +84,8 @@ class XArmEnv(gym.Env):
     ):
         if obs_type not in OBS_TYPES:
             raise ValueError(f"obs_type must be one of {OBS_TYPES}, got {obs_type!r}")
-        if not set(camera_names) <= set(CAMERAS):
-            raise ValueError(f"camera_names must be among {CAMERAS}, got {tuple(camera_names)}")
+        if not 0 < len(camera_names) == len(set(camera_names) & set(CAMERAS)):
+            raise ValueError(f"camera_names must name some of {CAMERAS}, each once, got {tuple(camera_names)}")
         if min(camera_height, camera_width) < 1:
             raise ValueError(f"a camera image has at least 1 pixel, got {camera_height} x {camera_width}")
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -126,6 +126,10 @@ class XArmEnv(gym.Env):
         self.task = planning_task.gym_id
         self.task_description = planning_task.instruction
         self._max_episode_steps = planning_task.horizon
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For a copy, which makes renderers of its own."""
+        return {**self.__dict__, "_renderers": {}}
 
     # What a task defines.
 

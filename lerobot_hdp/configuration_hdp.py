@@ -29,6 +29,8 @@ BACKBONE_STRIDE = 32
 """Pixels from one cell of its feature maps to the next."""
 RGB = 3
 """Channels of an image."""
+NARROWEST_WIDTH = 4
+"""Two sines and two cosines of a diffusion step."""
 SAMPLERS = ["ddpm", "ddim", "confidence"]
 
 AT_LEAST_1 = ["num_layers", "num_heads", "width", "num_train_timesteps", "horizon", "symbolic_horizon"]
@@ -123,8 +125,8 @@ class HDPConfig(PreTrainedConfig):
             soon as the planner is sure of them, which needs far fewer steps.
         confidence_threshold: how probable a symbol must be for the `confidence` sampler to reveal it. What a step
             reveals is drawn independently, so that a low threshold makes plans that contradict themselves.
-        symbol_lead: share of the network calls in which the masked symbols are revealed beside a motion that is still
-            pure noise. Without a lead, few steps let the motion choose a plan of its own before the symbols have made
+        symbol_lead: share of the network calls in which the symbols are denoised beside a motion that is still pure
+            noise. Without a lead, few steps let the motion choose a plan of its own before the symbols have made
             up theirs. There is none where a part of the motion is given, or all symbols of a whole batch.
         num_inference_steps: network calls for a plan; N where the preset says nothing else.
         prompt: a part of every plan, in words (prompt.py, docs/conditioning.md). None: what the environment asks for.
@@ -247,12 +249,14 @@ class HDPConfig(PreTrainedConfig):
                 raise ParsingError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 <= self.symbol_lead < 1:
             raise ParsingError(f"symbol_lead must be at least 0 and less than 1, got {self.symbol_lead}")
-        if self.lead_share and self.symbol_process != "masked":
-            raise ParsingError("lead_share is about masked symbols, which this planner does not have: leave it at 0")
+        if self.lead_share and (self.symbol_process is None or self.shared_level):
+            raise ParsingError("lead_share is about symbols with a level of their own, which this planner has not")
         if self.resize_shape is not None and min(self.resize_shape) < 1:
             raise ParsingError(f"resize_shape is a height and a width of at least 1, got {self.resize_shape}")
-        if self.width % self.num_heads or self.width % 2:
-            raise ParsingError(f"width must be even and divisible by {self.num_heads=}, got {self.width}")
+        if self.width % self.num_heads or self.width % 2 or self.width < NARROWEST_WIDTH:
+            raise ParsingError(
+                f"width must be even, divisible by {self.num_heads=} and at least {NARROWEST_WIDTH}, got {self.width}"
+            )
         if self.rotary and self.width // self.num_heads % 2:
             raise ParsingError(
                 f"rotary embedding needs an even width / num_heads, got {self.width} / {self.num_heads}: "
@@ -285,8 +289,14 @@ class HDPConfig(PreTrainedConfig):
         """Take over what the dataset says about itself. LeRobot calls this before it builds the policy.
 
         Raises:
-            ValueError: the dataset has no symbolic plans, they do not fit, or they speak another vocabulary.
+            ValueError: the dataset has no symbolic plans, they do not fit, or they speak another vocabulary; or weights
+                would be loaded without the settings that they were trained with.
         """
+        if self.pretrained_path is not None and self.observation_token_sizes is None:
+            raise ValueError(
+                "--policy.pretrained_path takes the weights of a checkpoint, and none of the settings that give them "
+                f"their meaning: leave out --policy.type, and train on with --policy.path={self.pretrained_path}"
+            )
         self.input_features.pop(OBS_SYMBOLIC_PLAN, None)  # token ids are no numbers to normalise
         for key, feature in self.image_features.items():
             if not self.observes_camera(key, feature):

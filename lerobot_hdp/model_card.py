@@ -16,27 +16,30 @@ SUMMARIES = {
 }
 
 
-def describe_planner(card: ModelCard, config: HDPConfig, env: EnvConfig | None = None) -> ModelCard:
+def describe_planner(card: ModelCard, config: HDPConfig, fps: int | None, env: EnvConfig | None = None) -> ModelCard:
     """Say below the card's title what the planner is, what it needs and how it is asked for a plan.
 
     Args:
         card: as LeRobot makes it.
         config: of the planner, complete with what the dataset says.
+        fps: actions a second in its dataset, where that is known.
         env: that of its training configuration. In one of ours, `hdp-plan` draws and executes plans.
     """
     where = config.repo_id or "<repository>"
     lines = [
         SUMMARIES.get(config.type, f"A planner of type `{config.type}`."),
-        f"From one observation it plans {config.horizon} actions, in {config.num_inference_steps} network calls, and "
-        f"the robot executes {config.n_action_steps or 'all'} of them before it plans again.",
+        f"From one observation it plans {config.horizon} actions, in {config.num_inference_steps} network calls. "
+        + _say_what_is_executed(config, fps),
         "LeRobot knows this policy when the plugin `lerobot_policy_hdp` is installed.",
     ]
     if config.symbol_process is not None:
         _, *symbols = config.vocabulary or ["PAD"]
         words = " ".join(f"`{symbol}`" for symbol in symbols)
+        # A plan may not begin with this symbol. Planners of Gaussian symbols must be told its position.
+        prompt = f"... {symbols[0]} ..." if config.symbol_process == "masked" else f"2:{symbols[0]}"
         lines += [
             f"Symbols, at most {config.symbolic_horizon} in a plan: {words}. A part of the plan may be given in these "
-            f'words, `_` standing for any one: `--policy.prompt="{symbols[0]} ..."`.',
+            f'words, and the planner adds the rest: `--policy.prompt="{prompt}"`.',
         ]
     if env is not None and env.type == "hdp":
         lines += [
@@ -46,3 +49,10 @@ def describe_planner(card: ModelCard, config: HDPConfig, env: EnvConfig | None =
     title, rest = card.text.split("# ", 1)[1].split("\n", 1)
     card.text = "\n\n".join([f"# {title}", *lines]) + "\n" + rest
     return card
+
+
+def _say_what_is_executed(config: HDPConfig, fps: int | None) -> str:
+    if config.plan_from == "any_frame":
+        return f"The robot executes {config.n_action_steps or 'all'} of them before it plans again."
+    end = f": `--fps={fps} --duration={config.horizon / fps:.1f}`" if fps else ""
+    return f"They are a whole episode, executed without another look. In `lerobot-rollout`, end there{end}."

@@ -6,12 +6,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial, wraps
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
 from huggingface_hub import ModelCard
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from safetensors import SafetensorError
@@ -110,6 +111,7 @@ class HDPPolicy(PreTrainedPolicy):
         dataset_meta: metadata of the dataset that the policy is to be trained on; its episodes are checked against
             the horizon. With it, a new policy's image encoders start from `pretrained_backbone_weights`; a checkpoint
             has weights of its own.
+        kwargs: `from_pretrained` hands over what was meant for the configuration, such as `cli_overrides`.
     """
 
     config_class = HDPConfig
@@ -117,12 +119,12 @@ class HDPPolicy(PreTrainedPolicy):
     can_score = True
     """Whether it can say how likely a plan is, and so choose among candidates."""
 
-    def __init__(self, config: HDPConfig, dataset_stats: Any = None, dataset_meta: Any = None):
+    def __init__(self, config: HDPConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any):
         super().__init__(config)
         config.validate_features()
         widen_narrow_ranges(config, dataset_stats or {})
-        if config.num_candidates > 1 and not self.can_score:
-            raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
+        if config.num_candidates > 1:
+            self._check_can_score()
         if dataset_meta is not None and config.plan_from == "episode_start":
             _check_episodes_fit(config, dataset_meta.episodes["length"])
         self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
@@ -296,14 +298,14 @@ class HDPPolicy(PreTrainedPolicy):
             check: the task's checker. The candidates with the fewest complaints are preferred to all others.
 
         Raises:
-            ValueError: an observation with NaN or infinity, a prompt that does not fit, or a checker with nothing to
-                choose from.
+            ValueError: an observation with NaN or infinity, a prompt that does not fit, a checker with nothing to
+                choose from, or several candidates from a planner that cannot score them.
         """
         batch = self._encode_once(batch)
         k = num_candidates
         if k is None:
-            partial = isinstance(prompt, PlanPrompt) and prompt.gives_part_of_motion and self.can_score
-            k = max(self.config.num_candidates, PARTIAL_MOTION_CANDIDATES if partial else 1)
+            several = isinstance(prompt, PlanPrompt) and prompt.gives_part_of_motion and self.can_score
+            k = max(self.config.num_candidates, PARTIAL_MOTION_CANDIDATES if several else 1)
         if k < 1:
             raise ValueError(f"num_candidates must be at least 1, got {k}")
         if k == 1:
@@ -311,6 +313,7 @@ class HDPPolicy(PreTrainedPolicy):
                 raise ValueError("a checker chooses among candidates: set num_candidates to more than 1")
             return self._sample(batch, self.read_prompt(batch, prompt, generator), generator, on_step)
 
+        self._check_can_score()
         asked = [key for key in (OBS_SYMBOLIC_PLAN, CONDITION) if key in batch]
         repeated = {key: batch[key].repeat_interleave(k, dim=0) for key in asked}
         if isinstance(prompt, PlanPrompt):
@@ -337,10 +340,13 @@ class HDPPolicy(PreTrainedPolicy):
         Raises:
             ValueError: this planner cannot say.
         """
-        if not self.can_score:
-            raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
+        self._check_can_score()
         processes = self.motion_process, self.symbol_process
         return score_plans(self._denoiser(batch), *processes, plan.actions, plan.token_ids)
+
+    def _check_can_score(self) -> None:
+        if not self.can_score:
+            raise ValueError(f"a planner of type {self.name} cannot score its plans: leave num_candidates at 1")
 
     @torch.no_grad()
     @_without_dropout
@@ -374,9 +380,11 @@ class HDPPolicy(PreTrainedPolicy):
         if prompt is None:
             return PlanPrompt()
         if not isinstance(prompt, PlanPrompt):
-            if self.vocabulary is None:
-                raise ValueError("this planner models no symbols: it takes no symbolic prompt")
             texts = _one_text_each(prompt, self._batch_size(batch))
+            if self.vocabulary is None:
+                if any(texts):
+                    raise ValueError("this planner models no symbols: it takes no symbolic prompt")
+                return PlanPrompt()
             ask = partial(self._ask_for_symbols, batch, generator)
             length = self.config.symbolic_horizon
             prompt = PlanPrompt(token_ids=place_prompts(texts, self.vocabulary, length, self._device, ask, generator))
@@ -452,7 +460,7 @@ class HDPPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
-        """The plan's actions that are executed before the next plan: (B, n_action_steps, D)."""
+        """The actions that are executed before the next plan: (B, n_action_steps, D), all H_c where that is None."""
         return self.plan(batch).actions[:, : self.config.n_action_steps]
 
     @torch.no_grad()
@@ -499,12 +507,18 @@ class HDPPolicy(PreTrainedPolicy):
         """(B, H_c, D)."""
         return self._batch_size(batch), self.config.horizon, self.config.action_feature.shape[0]
 
-    def generate_model_card(self, *args: Any, cfg: TrainPipelineConfig | None = None, **kwargs: Any) -> ModelCard:
+    def generate_model_card(
+        self,
+        *args: Any,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs: Any,
+    ) -> ModelCard:
         """The README.md that goes to the Hub with the weights: LeRobot's, and what this planner is."""
-        card = super().generate_model_card(*args, cfg=cfg, **kwargs)
-        return describe_planner(card, self.config, cfg.env if cfg else None)
+        card = super().generate_model_card(*args, cfg=cfg, dataset_meta=dataset_meta, **kwargs)
+        return describe_planner(card, self.config, dataset_meta.fps if dataset_meta else None, cfg.env if cfg else None)
 
-    def _validate_peft_config(self, peft_config: Any) -> None:
+    def wrap_with_peft(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Refuse adapters.
 
         Raises:

@@ -105,7 +105,7 @@ def sample_plan(
         symbolic_horizon: H_d.
         device: where the plan is made.
         num_steps: number of calls of the denoiser.
-        symbol_lead: share of them in which the motion stays pure noise, while masked symbols are revealed; less than 1.
+        symbol_lead: share of them in which the motion stays pure noise, while the symbols are denoised; less than 1.
         shared_level: whether k_d is always k_c.
         prompt: the part of the plan that is given.
         generator: source of all randomness; None: PyTorch's global one.
@@ -113,7 +113,8 @@ def sample_plan(
     """
     prompt = prompt or PlanPrompt()
 
-    lead = _steps_ahead(prompt, symbol_lead, num_steps) if isinstance(symbol_process, MaskedProcess) else 0
+    can_lead = symbol_process is not None and not shared_level
+    lead = _steps_ahead(prompt, symbol_lead, num_steps) if can_lead else 0
 
     def start(
         process: Process, shape: tuple[int, ...], steps: int, clean: Tensor | None, given: Tensor | None

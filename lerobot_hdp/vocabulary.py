@@ -79,7 +79,7 @@ class Vocabulary:
         Raises:
             ValueError: an id that is no symbol's.
         """
-        ids = [int(i) for i in ids]
+        ids = ids.tolist() if isinstance(ids, Tensor) else [int(i) for i in ids]
         while ids and ids[-1] == PAD_ID:
             ids.pop()
         for position, i in enumerate(ids):

@@ -1,6 +1,7 @@
 """The contract that every planner keeps, and what each baseline does differently."""
 
 import json
+import re
 import shutil
 import warnings
 
@@ -120,12 +121,14 @@ class TestContract:
         assert {"lerobot", "robotics", planner, "xarm"} == set(card.data.tags)
         assert card.content.count("# Model Card for") == 1
         assert "From one observation it plans 19 actions" in card.content
+        assert "`--fps=10 --duration=1.9`" in card.content
         assert "`lerobot_policy_hdp`" in card.content
         assert "| `observation.environment_state` |" in card.content
-        assert ('`--policy.prompt="A ..."`' in card.content) == (planner in WITH_SYMBOLS)
-        if planner in WITH_SYMBOLS:
-            given = policy.read_prompt(inputs, "A ...").token_ids
-            assert policy.vocabulary.symbols[given[0, 0]] == "A"
+        prompts = re.findall(r'`--policy.prompt="(.+)"`', card.content)
+        assert len(prompts) == (planner in WITH_SYMBOLS)
+        for prompt in prompts:
+            given = policy.read_prompt(inputs, prompt).token_ids
+            assert (given == policy.vocabulary.token_id("A")).sum(dim=1).tolist() == [1] * len(given)
         assert "hdp-plan" not in card.content  # an environment of ours is not known of
         trained = TrainPipelineConfig(DatasetConfig("local/sorting"), env=HDPEnv(task="BlockSorting2D-v0", n_blocks=2))
         card = policy.generate_model_card(*about, cfg=trained, dataset_meta=dataset.meta)
@@ -412,9 +415,11 @@ class TestWithoutSymbols:
 
     def test_takes_no_symbolic_prompt(self, make_planner, batch, planner):
         policy, preprocessor, _ = make_planner(planner)
-        prompt = PlanPrompt(token_ids=torch.zeros(4, 18, dtype=torch.int64))
-        with pytest.raises(ValueError, match="models no symbols"):
-            policy.eval().plan(observation(preprocessor(batch)), prompt)
+        inputs = observation(preprocessor(batch))
+        for prompt in (PlanPrompt(token_ids=torch.zeros(4, 18, dtype=torch.int64)), "PICK A"):
+            with pytest.raises(ValueError, match="models no symbols"):
+                policy.eval().plan(inputs, prompt)
+        assert policy.plan(inputs, "").actions.shape == (4, HORIZON, 3)
 
 
 @pytest.mark.parametrize("planner", HIERARCHICAL)

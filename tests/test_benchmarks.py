@@ -1,6 +1,7 @@
 """The benchmarks can be started, say how, and have written the pages that are committed."""
 
 import importlib
+import json
 import pkgutil
 import shutil
 
@@ -49,3 +50,23 @@ def test_the_comparison_of_planners_is_what_the_committed_results_make(tmp_path,
     monkeypatch.setattr(module, "plot_curves", lambda *_: None)
     module.write_page(make_cells(PRESETS, TASKS, METHODS, [0, 1]))
     assert module.PAGE.read_text() == committed.read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("planner_latency", ["--rounds=2", "--batch_sizes", "1", "--num_layers=1", "--width=32"]),
+        ("growth", ["--rounds=2", "--horizons", "37", "--blocks", "2", "--batch_size=2"]),
+        ("few_step_planning", ["checkpoints/xarm_arrange_blocks", "--starts=2", "--calls", "2", "--ways", "ddpm"]),
+    ],
+)
+def test_a_benchmark_runs(name, arguments, tmp_path, monkeypatch, capsys):
+    module = importlib.import_module(f"benchmarks.{name}")
+    for place in ("FILE", "FILES", "FOLDER", "PAGE"):
+        if hasattr(module, place):
+            monkeypatch.setattr(module, place, tmp_path / getattr(module, place).name)
+    monkeypatch.setattr("sys.argv", [name, *arguments])
+    module.main()
+    [result] = tmp_path.rglob("*.json")
+    assert {"run", "result"} == set(json.loads(result.read_text()))
+    assert "not run" not in (tmp_path / module.PAGE.name).read_text()

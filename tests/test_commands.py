@@ -7,15 +7,18 @@ import subprocess
 from html import unescape
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_tools import modify_features, recompute_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_edit_dataset, lerobot_train
 from safetensors.torch import load_file
 
-from lerobot_hdp import Vocabulary
-from lerobot_hdp.scripts import hdp_plan
+from lerobot_hdp import HDPConfig, Vocabulary
+from lerobot_hdp.scripts import hdp_plan, hdp_train
 
 from .conftest import HORIZON, N_EPISODES, REPOSITORY, TASK_FLAGS, TINY_PLANNER, call_command, run_command
 
@@ -103,6 +106,30 @@ def test_a_checkpoint_can_be_fine_tuned(dataset_root, checkpoint, tmp_path):
     name = "planner.denoiser.motion_head.weight"
     assert not torch.equal(tuned[name], start[name])
     torch.testing.assert_close(tuned[name], start[name], atol=0.01, rtol=0)
+
+
+def test_weights_without_their_settings_are_refused(dataset_root, checkpoint, tmp_path):
+    flags = train_flags(dataset_root, tmp_path / "run")
+    with pytest.raises(ValueError, match=f"leave out --policy.type, and train on with --policy.path={checkpoint}"):
+        call_command(lerobot_train.main, *flags, f"--policy.pretrained_path={checkpoint}")
+
+
+def test_renamed_observations_are_normalised(dataset_root, checkpoint, tmp_path):
+    """By the statistics of the new dataset, as those that keep their names."""
+    recorded = LeRobotDataset("test/sorting", root=dataset_root, video_backend="pyav")
+    states, column = np.stack(recorded.hf_dataset["observation.state"]), recorded.meta.features["observation.state"]
+    added = {"observation.joints": (10 * states, {**column, "names": ["joint"] * 3})}
+    other = modify_features(recorded, added, "observation.state", tmp_path / "other", "test/sorting")
+    recompute_stats(other)
+    flags = train_flags(other.root, tmp_path / "run", [f"--policy.path={checkpoint}"])
+    call_command(hdp_train.main, *flags, '--rename_map={"observation.joints": "observation.state"}')
+    tuned = tmp_path / "run/checkpoints/last/pretrained_model"
+    preprocess, _ = make_pre_post_processors(HDPConfig.from_pretrained(tuned), tuned)
+    state, poses = (recorded[0][key] for key in ("observation.state", "observation.environment_state"))
+    renamed = preprocess({"observation.joints": 10 * state, "observation.environment_state": poses})
+    preprocess, _ = make_pre_post_processors(HDPConfig.from_pretrained(checkpoint), checkpoint)
+    as_before = preprocess({"observation.state": state, "observation.environment_state": poses})
+    torch.testing.assert_close(renamed["observation.state"], as_before["observation.state"])
 
 
 def test_training_refuses_what_does_not_fit(dataset_root, tmp_path):

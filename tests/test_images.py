@@ -1,14 +1,16 @@
 """Planners that see the scene through cameras, from recording to execution."""
 
 import json
+import signal
 
+import numpy as np
 import pytest
 import torch
 from draccus.utils import ParsingError
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.scripts import lerobot_eval, lerobot_train
+from lerobot.scripts import lerobot_eval, lerobot_rollout, lerobot_train
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from safetensors.torch import load_file
 from torch.utils.data import default_collate
@@ -21,6 +23,7 @@ from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.scripts import hdp_plan, hdp_train
 
 from .conftest import TINY_PLANNER, call_command, train_in_process
+from .simulatedarm import SimulatedArm
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 TASK = {"task": "XArmArrangeBlocks-v0", "obs_type": "pixels", "camera_names": ("front",)}
@@ -83,6 +86,35 @@ def test_lerobot_eval_plans_from_images(runs, tmp_path):
         *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", f"--output_dir={tmp_path}"),
     )
     assert json.loads((tmp_path / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
+
+
+@pytest.fixture
+def signal_handlers():
+    """Those of before a command that installs its own."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("signal_handlers")
+def test_lerobot_rollout_executes_a_plan(runs, tmp_path):
+    path = runs[1] / "checkpoints/last/pretrained_model"
+    call_command(
+        lerobot_rollout.main,
+        *(f"--policy.path={path}", "--policy.device=cpu", "--device=cpu", "--fps=25", "--duration=1"),
+        *("--robot.type=simulated_arm", f"--robot.env.task={TASK['task']}", "--robot.env.obs_type=pixels"),
+        *("--robot.env.camera_names=[front]", "--robot.env.camera_height=48", "--robot.env.camera_width=64"),
+        *(f"--robot.calibration_dir={tmp_path}", "--return_to_initial_position=false"),
+    )
+    arm = SimulatedArm.last
+    policy = HDPPolicy.from_pretrained(path, cli_overrides=["--device=cpu"])
+    preprocess, postprocess = make_pre_post_processors(policy.config, path)
+    image = torch.tensor(arm.seen["front"]).permute(2, 0, 1) / 255
+    torch.manual_seed(0)
+    waypoints = postprocess(policy.plan(preprocess({FRONT: image[None]})).actions)[0]
+    assert 1 < len(arm.sent) <= len(waypoints)
+    torch.testing.assert_close(torch.tensor(np.array(arm.sent)), waypoints[: len(arm.sent)])
 
 
 def test_another_camera_is_refused(runs, tmp_path):

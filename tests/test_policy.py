@@ -128,8 +128,9 @@ def test_loss_is_the_weighted_sum_of_its_logged_parts(make_planner, batch):
 
 
 @pytest.mark.parametrize("lead_share", [0.0, 1.0])
-def test_training_shows_symbols_that_lead_as_often_as_it_is_told(make_planner, batch, lead_share):
-    policy, preprocessor, _ = make_planner(lead_share=lead_share)
+@pytest.mark.parametrize("planner", ["hdp", "separate_diffuser"])
+def test_training_shows_symbols_that_lead_as_often_as_it_is_told(make_planner, batch, planner, lead_share):
+    policy, preprocessor, _ = make_planner(planner, lead_share=lead_share)
     seen = []
     policy.planner.denoiser.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[-2:]))
     for _ in range(5):
@@ -164,8 +165,9 @@ def motion_moves(policy, inputs, prompt=None):
 
 
 @pytest.mark.parametrize("sampler", ["ddpm", "ddim", "confidence"])
-def test_symbols_lead_a_motion_that_is_pure_noise(make_planner, batch, sampler):
-    policy, preprocessor, _ = make_planner(sampler=sampler, num_inference_steps=10, symbol_lead=0.3)
+@pytest.mark.parametrize("planner", ["hdp", "separate_diffuser"])
+def test_symbols_lead_a_motion_that_is_pure_noise(make_planner, batch, planner, sampler):
+    policy, preprocessor, _ = make_planner(planner, sampler=sampler, num_inference_steps=10, symbol_lead=0.3)
     inputs, levels = observation(preprocessor(batch)), []
     policy._planning_network.denoiser.register_forward_pre_hook(
         lambda _, arguments: levels.append((arguments[3].max().item(), arguments[4].min().item()))
@@ -173,7 +175,7 @@ def test_symbols_lead_a_motion_that_is_pure_noise(make_planner, batch, sampler):
     assert motion_moves(policy, inputs) == [False] * 3 + [True] * 7
     assert [k_c for k_c, _ in levels[:4]] == [1.0] * 4
     assert levels[4][0] < 1
-    assert levels[3][1] < levels[0][1] == 1  # symbols have been revealed meanwhile
+    assert levels[3][1] < levels[0][1] == 1  # symbols have been denoised meanwhile
 
 
 def test_symbols_that_have_something_to_follow_do_not_lead(make_planner, batch):
@@ -189,10 +191,12 @@ def test_symbols_that_have_something_to_follow_do_not_lead(make_planner, batch):
     assert motion_moves(policy, observation(inputs), some_symbols) == [False, False, True, True]
 
 
-@pytest.mark.parametrize("planner", ["diffuser", "joint_diffuser", "separate_diffuser"])
-def test_without_masked_symbols_nothing_leads(make_planner, batch, planner):
+@pytest.mark.parametrize("planner", ["diffuser", "joint_diffuser"])
+def test_without_symbols_of_a_level_of_their_own_nothing_leads(make_planner, batch, planner):
     policy, preprocessor, _ = make_planner(planner, num_inference_steps=4, symbol_lead=0.5)
     assert motion_moves(policy, observation(preprocessor(batch))) == [True] * 4
+    with pytest.raises(ParsingError, match="lead_share"):
+        make_planner(planner, lead_share=0.3)
 
 
 def test_given_symbols_stay_fixed_in_every_step(make_planner, batch):
@@ -353,7 +357,7 @@ def test_a_planner_with_averaged_weights_can_be_trained_on_without(make_planner,
 
 def test_adapters_are_refused(make_planner):
     with pytest.raises(ValueError, match="leave out --peft"):
-        make_planner()[0]._validate_peft_config(None)
+        make_planner()[0].wrap_with_peft(peft_cli_overrides={"r": 4})
 
 
 def test_a_held_out_loss_depends_on_nothing_but_weights_and_data(make_planner, batch):
@@ -580,6 +584,7 @@ class TestBadInput:
             {"dtype": "float8"},
             {"n_obs_steps": 2},
             {"width": 30, "num_heads": 4},
+            {"width": 2, "num_heads": 1},
             {"horizon": 0},
             {"horizon": 10, "n_action_steps": 11},
             {"n_action_steps": 5, "horizon": 10},  # with plan_from=episode_start

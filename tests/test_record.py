@@ -225,6 +225,30 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_pa
     assert not config.partial_root.exists()
 
 
+def test_a_worker_that_is_killed_ends_the_recording_with_one_line(tmp_path):
+    """As when memory runs out."""
+    flags = flags_of(200, tmp_path / "stopped")
+    command = [Path(sys.executable).with_name("hdp-record"), *flags, "--num_workers=2"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    while not list((tmp_path / "stopped.partial").glob("*.done")):
+        assert process.poll() is None
+        time.sleep(0.01)
+    children = psutil.Process(process.pid).children(recursive=True)
+    max(children, key=lambda child: child.cpu_times().user).kill()
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "Traceback" not in stderr
+    assert "hdp-record: a worker ended" in stderr.splitlines()[-1]
+
+
+def test_no_recorded_start_is_one_that_is_evaluated():
+    recorded = {
+        episode_seed(seed, episode, attempt) for seed in (0, 1, 2) for episode in range(4_000) for attempt in (0, 1)
+    }
+    evaluated = {first + number for first in (0, 1_000_000, 2_000_000, 3_000_000) for number in range(2_000)}
+    assert not recorded & evaluated
+
+
 def test_the_command_goes_on_with_an_interrupted_recording_only_when_told_to(tmp_path):
     config, flags = config_of(2, tmp_path / "stopped"), flags_of(2, tmp_path / "stopped")
     first_shard, _ = plan_shards(config)

@@ -107,8 +107,9 @@ def test_an_episode_depends_on_its_seed_alone(gym_id):
     assert not np.array_equal(first[0], other[0])
 
 
-def test_a_copy_goes_on_from_the_same_state_and_leaves_the_original_alone():
-    env, actions = make("hdp/XArmArrangeBlocks-v0"), np.random.default_rng(0)
+@pytest.mark.parametrize("obs_type", ["state", "pixels_state"])
+def test_a_copy_goes_on_from_the_same_state_and_leaves_the_original_alone(obs_type):
+    env, actions = make("hdp/XArmArrangeBlocks-v0", obs_type=obs_type), np.random.default_rng(0)
     plan = actions.uniform(env.action_space.low, env.action_space.high, size=(4, 4))
     env.reset(seed=0)
     env.step(plan[0])
@@ -242,6 +243,8 @@ def test_an_action_that_is_no_waypoint_is_refused(action):
         {"obs_type": "smell"},
         {"robot": "panda"},
         {"camera_names": ("side",)},
+        {"camera_names": ()},
+        {"camera_names": ("front", "front")},
         {"camera_height": 0},
     ],
 )

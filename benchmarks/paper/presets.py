@@ -35,12 +35,14 @@ class Training:
         steps: of the optimiser.
         batch_size: samples a step.
         policy: options that differ from the preset's.
+        hdp_policy: options of HDP, beside the others'.
     """
 
     demonstrations: int
     steps: int
     batch_size: int
     policy: dict[str, Any] = field(default_factory=dict)
+    hdp_policy: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ PRESETS: dict[str, Preset] = {
         policy={"preset": "default", "dtype": "bfloat16", "optimizer_lr": 1e-3},
         tasks={
             "xarm_sorting": Training(200, 2_400, 50, {**_SMALL_LR, **_AT_FIRST_THRESHOLD}),
-            "xarm_arrange_blocks": Training(4_000, 3_000, 50, {**_MANY_DEMONSTRATIONS, **_AT_FIRST_THRESHOLD}),
+            "xarm_arrange_blocks": Training(4_000, 3_000, 50, _AT_FIRST_THRESHOLD, _MANY_DEMONSTRATIONS),
             "xarm_tool_use": Training(400, 2_000, 50, {**_SMALL_LR, **_AT_FIRST_THRESHOLD}),
             **_TASKS_2D,
         },
@@ -112,7 +114,7 @@ PRESETS: dict[str, Preset] = {
         policy={"preset": "default", "dtype": "bfloat16", **_SMALL_LR, **_MINI_XARM},
         tasks={
             "xarm_sorting": Training(200, 2_400, 50),
-            "xarm_arrange_blocks": Training(4_000, 5_000, 50, _MANY_DEMONSTRATIONS),
+            "xarm_arrange_blocks": Training(4_000, 5_000, 50, hdp_policy=_MANY_DEMONSTRATIONS),
             "xarm_tool_use": Training(400, 2_000, 50),
             "xarm_sorting_images": Training(200, 1_500, 50),
             **_TASKS_2D,
@@ -184,7 +186,9 @@ def complete(policy: dict[str, Any], env: dict[str, Any]) -> dict[str, Any]:
     config = PreTrainedConfig.get_choice_class(policy["type"])
     unused = {"type"}
     if config.symbol_process != "masked":
-        unused |= {"confidence_threshold", "lead_share", "symbol_lead"}
+        unused |= {"confidence_threshold"}
+        if not policy.get("symbol_lead"):
+            unused |= {"symbol_lead"}
     if config.symbol_process is None:
         unused |= {"symbolic_horizon", "symbol_loss_weight"}
     options = {name: value for name, value in policy.items() if name not in unused}
@@ -206,7 +210,7 @@ def make_cell(preset_name: str, task: str, method: str, seed: int) -> Cell:
     training = preset.tasks[task]
     policy = {"type": method, **preset.policy, **training.policy}
     if method == "hdp":
-        policy |= preset.hdp_policy
+        policy |= preset.hdp_policy | training.hdp_policy
     return Cell(
         group=f"paper/{preset_name}",
         name=f"{task}_{method}_seed{seed}",

@@ -1,4 +1,4 @@
-"""The planners that differ from HDP in how symbols are corrupted, and in nothing else."""
+"""The planners that differ from HDP in how symbols are corrupted, and in what follows from it."""
 
 from dataclasses import dataclass
 
@@ -26,11 +26,13 @@ class SeparateDiffuserConfig(HDPConfig):
 
     Attributes:
         symbol_loss_weight: weight of the symbols' mean squared error beside the motion's.
+        symbol_lead: as in HDP, but 0 unless it is set.
     """
 
     symbol_process = "gaussian"
 
     symbol_loss_weight: float | None = 0.1
+    symbol_lead: float | None = 0.0
 
 
 @PreTrainedConfig.register_subclass("joint_diffuser")

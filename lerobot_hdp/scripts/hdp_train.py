@@ -26,6 +26,7 @@ import torch
 from lerobot.configs import FeatureType
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
+from lerobot.processor.rename_processor import rename_stats
 from lerobot.scripts import lerobot_train
 from lerobot.utils.collate import lerobot_collate_fn
 from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -52,6 +53,8 @@ def hold_datasets_in_memory(max_gib: float) -> None:
         users_num_workers = cfg.num_workers
         train_and_eval = make_datasets(cfg)
         opened = [dataset for dataset in train_and_eval if dataset is not None]
+        # LeRobot renames observations before it normalises them, but not their statistics.
+        opened[0].meta.stats |= rename_stats(opened[0].meta.stats, cfg.rename_map)
         leave_out = _unused_cameras(cfg, opened[0].meta.features) if isinstance(cfg.policy, HDPConfig) else []
         first_images_only = _plans_whole_episodes(cfg)
         if (reason := _why_not_in_memory(opened, leave_out, first_images_only, max_gib)) is not None:
