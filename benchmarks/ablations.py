@@ -106,7 +106,7 @@ alone have 19 % in the table, symbols that lead, in 10 network calls where `mini
 
 **lead_share** shows the planner more samples whose motion is pure noise, where the symbols decide which plan it makes.
 In arranging that is what is left to learn: which slot another block leaves no room to reach. It is no part of the
-preset, because it needs thousands of demonstrations: `small` has it in arranging, with 4,000, and loses 8 points
+preset, because it needs thousands of demonstrations: `small` has it in arranging, with 4,000, and loses 7 points
 [without it](#todays-preset).
 
 What is left of the failures in arranging is the plan itself, which takes a slot where another block leaves no room for

@@ -35,11 +35,12 @@ PREAMBLE = """# Plans in few network calls
 
 Success in % of fresh starts (95 % interval), over the network calls for a plan.
 
-- `ddpm` is the paper's sampler, which uses 100 calls, and `ddim` draws the motion's noise at the start only.
+- `ddpm` is the paper's sampler, and `ddim` draws the motion's noise at the start only. (The paper does not say how many
+  calls it uses; Diffusion Policy, on which it builds, uses 100.)
 - `confidence` is DDIM for the motion, and symbols revealed as soon as the planner is sure of them: with
-  `confidence_threshold=0.95`, or what is named instead. The lower it is, the more symbols are drawn at once that know
-  nothing of each other. Where a planner has learned its plans, it is sure of nearly all of them and the threshold
-  makes no difference.
+  `confidence_threshold=0.95`, or what is named instead. A low threshold reveals more symbols in a call, but these are
+  drawn independently and may contradict each other. A planner that has learned its plans is sure of nearly all
+  symbols, and the threshold makes no difference.
 - *symbols lead* is the same with `symbol_lead=0.5`, the preset `default`: half of the calls reveal symbols beside a
   motion that is still pure noise, the other half denoise the motion. Without a lead, the motion may commit itself to a
   plan of its own before the symbols have made up theirs. With a lead, it has half of the calls: in arranging, 5 are

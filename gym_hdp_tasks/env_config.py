@@ -1,7 +1,7 @@
 """`--env.type=hdp`: LeRobot's view of the tasks."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from importlib import import_module
 from typing import Any
 
 from draccus.utils import ParsingError
@@ -9,21 +9,17 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from .block_sorting_2d import block_sorting_2d_task
-from .task import PlanningTask
-from .xarm_arrange_blocks import xarm_arrange_blocks_task
-from .xarm_env import CAMERAS, OBS_TYPES
-from .xarm_sorting import xarm_sorting_task
-from .xarm_tool_use import xarm_tool_use_red_on_top_task, xarm_tool_use_task
+from .task import CAMERAS, OBS_TYPES, PlanningTask
 
-TASKS: dict[str, Callable[..., PlanningTask]] = {
-    "BlockSorting2D-v0": block_sorting_2d_task,
-    "XArmSorting-v0": xarm_sorting_task,
-    "XArmArrangeBlocks-v0": xarm_arrange_blocks_task,
-    "XArmToolUse-v0": xarm_tool_use_task,
-    "XArmToolUseRedOnTop-v0": xarm_tool_use_red_on_top_task,
+TASKS = {
+    "BlockSorting2D-v0": "gym_hdp_tasks.block_sorting_2d:block_sorting_2d_task",
+    "XArmSorting-v0": "gym_hdp_tasks.xarm_sorting:xarm_sorting_task",
+    "XArmArrangeBlocks-v0": "gym_hdp_tasks.xarm_arrange_blocks:xarm_arrange_blocks_task",
+    "XArmToolUse-v0": "gym_hdp_tasks.xarm_tool_use:xarm_tool_use_task",
+    "XArmToolUseRedOnTop-v0": "gym_hdp_tasks.xarm_tool_use:xarm_tool_use_red_on_top_task",
 }
-"""Task name, as in `--env.task=`, to the function that states the task's facts."""
+"""Task name, as in `--env.task=`, to the function that states the task's facts. It is imported when the task is chosen:
+every command of LeRobot imports this module, also where there is no MuJoCo to be had."""
 BLOCK_SORTING_2D_ONLY = ("n_blocks", "waypoints_per_pose")
 XARM_ONLY = ("robot", "obs_type", "camera_names", "camera_height", "camera_width")
 """Fields of `HDPEnv` that not every task has."""
@@ -105,7 +101,8 @@ class HDPEnv(EnvConfig):
         """
         if self.task not in TASKS:
             raise ValueError(f"--env.task={self.task} is not a task of --env.type=hdp; choose one of {list(TASKS)}")
-        return TASKS[self.task](**self._task_parameters)
+        module, function = TASKS[self.task].split(":")
+        return getattr(import_module(module), function)(**self._task_parameters)
 
     @property
     def _task_parameters(self) -> dict[str, Any]:

@@ -3,10 +3,11 @@
 import mujoco
 import numpy as np
 
+from .task import FRONT_CAMERA
+
 BLOCK_HALF_SIZE = 0.02
 BLOCK_MASS = 0.05
 """In kilograms."""
-FRONT_CAMERA = "front"
 FRONT_CAMERA_FOVY = 42.0
 """In degrees, of the image's height."""
 

@@ -6,6 +6,8 @@ from typing import Any
 
 from .plan_rules import Observation
 
+FRONT_CAMERA, WRIST_CAMERA = CAMERAS = ("front", "wrist")
+OBS_TYPES = ("state", "pixels", "pixels_state")
 PAD = "PAD"
 """Symbol with id 0: fills a plan that is shorter than the symbolic horizon."""
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import mujoco
 
+from .task import WRIST_CAMERA
+
 ROBOTS = ("primitive", "menagerie")
 """`primitive` ships with this package; `menagerie` is MuJoCo Menagerie's `ufactory_xarm7` (extra `menagerie`)."""
 
@@ -20,7 +22,6 @@ MAX_JOINT_SPEED = 3.14
 ROBOT_CONTYPE = 2
 """Contact type of the robot's geoms: they meet the scene's geoms, never each other."""
 TCP_SITE = "tcp"
-WRIST_CAMERA = "wrist"
 
 _PRIMITIVE_XML = Path(__file__).parent / "assets" / "xarm7.xml"
 _ARMATURE = (0.5, 0.5, 0.3, 0.3, 0.3, 0.2, 0.2)

@@ -10,10 +10,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from .scene import BLOCK_HALF_SIZE, FRONT_CAMERA, FRONT_CAMERA_FOVY, furnish
-from .task import PlanningTask
+from .scene import BLOCK_HALF_SIZE, FRONT_CAMERA_FOVY, furnish
+from .task import CAMERAS, FRONT_CAMERA, OBS_TYPES, PlanningTask
 from .waypoint_motion import WaypointMotion
-from .xarm7 import ARM_JOINTS, GRIPPERS, ROBOT_CONTYPE, TCP_SITE, WRIST_CAMERA, robot_spec
+from .xarm7 import ARM_JOINTS, GRIPPERS, ROBOT_CONTYPE, TCP_SITE, robot_spec
 
 # All lengths in metres, in the robot's base frame: x forward, y left, z up from the table.
 WORKSPACE_LOW = np.array([0.22, -0.34, 0.016])
@@ -26,8 +26,6 @@ HOME_OFFSET = 0.03
 REST_TOLERANCE = 0.005
 """A block whose centre is within this of BLOCK_HALF_SIZE above the table lies flat on it."""
 
-OBS_TYPES = ("state", "pixels", "pixels_state")
-CAMERAS = (FRONT_CAMERA, WRIST_CAMERA)
 RENDER_HEIGHT, RENDER_WIDTH = 480, 640
 """Size of `render()`'s image, in pixels."""
 

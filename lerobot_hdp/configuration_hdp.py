@@ -335,7 +335,7 @@ class HDPConfig(PreTrainedConfig):
     def _set_symbols(self, features: dict[str, dict]) -> None:
         if OBS_SYMBOLIC_PLAN not in features:
             raise ValueError(
-                f"the dataset has no column '{OBS_SYMBOLIC_PLAN}'. Add one (README, 'Your own dataset'), or train "
+                f"the dataset has no column '{OBS_SYMBOLIC_PLAN}'. Add one (docs/own_dataset.md), or train "
                 "on the motion alone with --policy.type=diffuser."
             )
         feature = features[OBS_SYMBOLIC_PLAN]

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from html import unescape
 from pathlib import Path
 
@@ -106,6 +107,14 @@ def test_a_checkpoint_can_be_fine_tuned(dataset_root, checkpoint, tmp_path):
     name = "planner.denoiser.motion_head.weight"
     assert not torch.equal(tuned[name], start[name])
     torch.testing.assert_close(tuned[name], start[name], atol=0.01, rtol=0)
+
+
+def test_planners_are_known_where_mujoco_cannot_be_imported():
+    """As on a robot's computer without EGL: LeRobot imports the plugin in every command."""
+    code = "import sys; sys.modules['mujoco'] = None; import lerobot_policy_hdp; import lerobot.configs as c; "
+    code += "print(c.PreTrainedConfig.get_choice_class('hdp')(horizon=3, device='cpu').type)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.stdout == "hdp\n", result.stderr
 
 
 def test_weights_without_their_settings_are_refused(dataset_root, checkpoint, tmp_path):

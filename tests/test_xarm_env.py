@@ -18,7 +18,8 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from gym_hdp_tasks.env_config import HDPEnv
-from gym_hdp_tasks.xarm_env import CAMERAS, OBS_TYPES, WORKSPACE_HIGH, WORKSPACE_LOW
+from gym_hdp_tasks.task import CAMERAS, OBS_TYPES
+from gym_hdp_tasks.xarm_env import WORKSPACE_HIGH, WORKSPACE_LOW
 
 IDS = (
     "hdp/XArmSorting-v0",

@@ -6,7 +6,7 @@ import pytest
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from gym_hdp_tasks import xarm_arrange_blocks, xarm_sorting, xarm_tool_use
-from gym_hdp_tasks.env_config import TASKS
+from gym_hdp_tasks.env_config import HDPEnv
 from gym_hdp_tasks.scene import BLOCK_HALF_SIZE
 from gym_hdp_tasks.xarm_env import WORKSPACE_HIGH
 
@@ -36,7 +36,7 @@ def scored(gym_id, places):
     ],
 )
 def test_sizes_are_the_papers(task, horizon, symbolic_horizon, vocabulary):
-    facts = TASKS[task]()
+    facts = HDPEnv(task=task).planning_task
     assert (facts.horizon, facts.symbolic_horizon) == (horizon, symbolic_horizon)
     assert facts.vocabulary == tuple(vocabulary.split())
     assert len(facts.action_names) == 4
