@@ -300,6 +300,15 @@ def test_hdp_plan_explains_a_dataset_without_symbols_and_without_a_task(checkpoi
     assert capsys.readouterr().out.endswith("the dataset has no symbolic plans\n")
 
 
+def test_hdp_plan_executes_a_plan_that_is_shorter_than_the_episode(make_planner, tmp_path, capsys):
+    policy, *processors = make_planner(plan_from="any_frame", horizon=7)
+    for saved in (policy, *processors):
+        saved.save_pretrained(tmp_path / "policy")
+    flags = (f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'plan'}", "--env.type=hdp", *TASK_FLAGS)
+    call_command(hdp_plan.main, *flags)
+    assert "executed: 7 actions, after which the episode goes on" in capsys.readouterr().out
+
+
 def test_hdp_plan_takes_a_planner_without_its_training_configuration(checkpoint, tmp_path, capsys):
     """As `policy.push_to_hub` uploads it."""
     policy = tmp_path / "policy"

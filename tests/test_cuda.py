@@ -5,13 +5,17 @@ import warnings
 import pytest
 import torch
 from lerobot.policies import get_policy_class
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from benchmarks.evaluation import evaluate
 from benchmarks.paper.presets import METHODS
 from benchmarks.training_step import GRAPHS
-from lerobot_hdp import PlanPrompt
+from lerobot_hdp import HDPConfig, PlanPrompt
+from lerobot_hdp.modeling_hdp import HDPPolicy
 
 from .conftest import REPOSITORY, TASK_FLAGS, TINY_PLANNER, observation, run_command, train_in_process
+
+IMAGE = "observation.images.front"
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="tests CUDA, which is not on this machine")
 
@@ -28,6 +32,20 @@ def test_the_network_predicts_the_same(make_planner, batch, dtype):
     tolerance = 1e-4 if dtype == "float32" else 3e-2
     for one, other in zip(found, expected, strict=True):
         assert (one.cpu() - other).norm() < tolerance * other.norm()
+
+
+def test_images_are_encoded_the_same(dataset):
+    camera = {"dtype": "video", "shape": (60, 80, 3), "names": ["height", "width", "channels"]}
+    features = {**dataset.meta.features, IMAGE: camera}
+    known = dataset_to_policy_features(features)
+    config = HDPConfig(**TINY_PLANNER, device="cpu", resize_shape=(48, 64), input_features={IMAGE: known[IMAGE]})
+    config.output_features = {"action": known["action"]}
+    config.set_dataset_feature_metadata(features)
+    policy, image = HDPPolicy(config).eval(), torch.rand(2, 3, 60, 80)
+    expected = policy.planner.encode({IMAGE: image})
+    found = policy.cuda().planner.encode({IMAGE: image.cuda()})
+    assert (found.cpu() - expected).norm() < 1e-3 * expected.norm()
+    assert policy.plan({IMAGE: image.cuda()}).actions.isfinite().all()
 
 
 @pytest.mark.parametrize("planner", METHODS)

@@ -28,12 +28,15 @@ def test_the_examples_in_python_run():
 
 
 def test_figures_that_link_to_a_results_file_are_what_it_says():
-    text = (REPOSITORY / "README.md").read_text()
-    figures = re.findall(r"\[(\d+) %\]\((benchmarks/results/paper/\S+\.json)\)", text)
-    assert len(figures) > 3
-    for figure, path in figures:
-        points = points_that_count(json.loads((REPOSITORY / path).read_text())["result"])
-        assert int(figure) == round(100 * mean(point["success_rate"] for point in points)), path
+    figures = [
+        (page.parent / path, int(figure))
+        for page in PAGES
+        for figure, path in re.findall(r"\[(\d+) %\]\((\S*benchmarks/results/\S+\.json)\)", page.read_text())
+    ]
+    assert len(figures) > 30
+    for path, figure in figures:
+        points = points_that_count(json.loads(path.read_text())["result"])
+        assert figure == round(100 * mean(point["success_rate"] for point in points)), path
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))

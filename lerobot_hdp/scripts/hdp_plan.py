@@ -101,15 +101,13 @@ class Result(NamedTuple):
     Attributes:
         text: the plan in words, see `Plan.describe`.
         complaints: what the task's checker has against the symbols; None: the task has no checker.
-        score: of the episode, in [0, 1].
-        is_success: what the environment says.
+        outcome: of the execution, in words.
         files: what was written, by what it is.
     """
 
     text: str
     complaints: list[str] | None
-    score: float
-    is_success: bool
+    outcome: str
     files: dict[str, Path]
 
 
@@ -187,17 +185,17 @@ def make_plan(config: PlanConfig) -> Result:
 
         config.output_dir.mkdir(parents=True, exist_ok=True)
         files = _draw(config, start, states, given)
-        score, is_success, frames = _execute(env, unnormalise(plan.actions[0]), render=config.html is not None)
+        outcome, frames = _execute(env, unnormalise(plan.actions[0]), render=config.html is not None)
         complaints = check(0, plan.symbols()) if task and policy.vocabulary else None
         step_ends = task.step_ends if task else None
         if config.html is not None:
             probabilities = plan.token_probabilities[0, : len(given)].tolist()
-            about = [_outcome(score, is_success), f"seed {config.seed}", *(complaints or [])]
+            about = [outcome, f"seed {config.seed}", *(complaints or [])]
             if prompt := config.prompt or policy.config.prompt:
                 about.insert(0, f"prompt: {prompt}")
             write_page(PlanPage(about, start, frames, states, probabilities, given, step_ends), config.html)
             files["page"] = config.html
-        return Result(plan.describe(0, step_ends), complaints, score, is_success, files)
+        return Result(plan.describe(0, step_ends), complaints, outcome, files)
     finally:
         close_envs(vector_envs)
 
@@ -276,7 +274,7 @@ def _check_task(planner: HDPConfig, task: Any) -> None:
     """Refuse a task (`planning_task` of an environment's configuration) for which the planner was not made."""
     features = planner.input_features
     facts = {
-        "horizon": (planner.horizon, task.horizon),
+        "horizon": (planner.horizon if planner.plan_from == "episode_start" else None, task.horizon),
         "vocabulary": (planner.vocabulary and " ".join(planner.vocabulary), " ".join(task.vocabulary)),
         "number of state components": (_size(features, OBS_STATE), len(task.state_names)),
         "number of objects' components": (_size(features, OBS_ENV_STATE), len(task.environment_state_names)),
@@ -313,8 +311,8 @@ def _project(env: gym.vector.VectorEnv, actions: np.ndarray) -> np.ndarray:
         raise ValueError("this environment has no world_to_pixels(points): its plans cannot be drawn") from error
 
 
-def _execute(env: gym.vector.VectorEnv, actions: np.ndarray, render: bool) -> tuple[float, bool, list[np.ndarray]]:
-    """Step through a plan: the score and the success at its end, and the scene after each waypoint.
+def _execute(env: gym.vector.VectorEnv, actions: np.ndarray, render: bool) -> tuple[str, list[np.ndarray]]:
+    """Step through a plan: what came of it, in words, and the scene after each waypoint.
 
     There is no picture of the scene after an episode's last step: vector environments have reset by then.
     """
@@ -322,15 +320,11 @@ def _execute(env: gym.vector.VectorEnv, actions: np.ndarray, render: bool) -> tu
     for action in actions:
         _, reward, terminated, truncated, info = env.step(action[None])
         if terminated[0] or truncated[0]:
-            final = info.get("final_info", info)
-            return float(reward[0]), bool(final["is_success"][0]), frames
+            is_success = info.get("final_info", info)["is_success"][0]
+            return f"executed: score {reward[0]:.2f}, {'success' if is_success else 'failure'}", frames
         if render:
             frames.append(env.call("render")[0])
-    return float(reward[0]), bool(info["is_success"][0]), frames
-
-
-def _outcome(score: float, is_success: bool) -> str:
-    return f"executed: score {score:.2f}, {'success' if is_success else 'failure'}"
+    return f"executed: {len(actions)} actions, after which the episode goes on", frames
 
 
 def print_plan(result: Result) -> None:
@@ -338,7 +332,7 @@ def print_plan(result: Result) -> None:
     print("plan:\n" + indent(result.text, "    "))
     if result.complaints is not None:
         print("checked: " + ("valid" if not result.complaints else "; ".join(result.complaints)))
-    print(_outcome(result.score, result.is_success))
+    print(result.outcome)
     for name, path in result.files.items():
         print(f"{name}: {path}")
 
