@@ -28,7 +28,7 @@ TASKS_2D = {f"block_sorting_2d_{n}_blocks": f"{n} blocks" for n in (2, 3, 4)}
 TITLES = {
     "paper": "The paper's hyperparameters",
     "default": "Our settings at the paper's network size",
-    "small": "Our settings with a network of a tenth of the size, on a CPU core",
+    "small": "Our settings with a network of a seventh of the size, on a CPU core",
     "small_adamw": "The same network, trained by AdamW, for longer, with condition tokens by an MLP",
     "mini": "Earlier settings, without rotary positions and Muon, on a CPU core",
     "mini_epsilon": "The same, predicting the noise, as the paper does",
@@ -65,10 +65,10 @@ def write_report(page: Path = DOCS / "results.md") -> list[Path]:
         "paper are as printed there. Finished "
         f"cells (a method, a task and one of the seeds {', '.join(map(str, SEEDS))}): {counts}.\n",
         "## The simulation table\n",
-        "The mean score and, in parentheses, its standard deviation over seeds and over the checkpoints at the end of "
-        "training, as the paper gives them; then the means of the seeds, or from three on the 95 % interval of the "
-        "mean over trainings (Student's t); last, how often the whole task was solved. The tasks are built after the "
-        "paper's description, in our own simulation: its figures stand beside ours for orientation. "
+        "Each cell gives the mean score and, in parentheses, its standard deviation over seeds and over the last "
+        "checkpoints, as in the paper. With two seeds, the mean of each follows; from three on, the 95 % interval of "
+        "the mean (Student's t). Last comes success: how often the whole task was solved. The tasks are built after "
+        "the paper's description, in our own simulation: its figures stand beside ours for orientation. "
         f"{floor(XARM_TASKS)}\n",
         "All settings were chosen by HDP's success, and then used for all planners; of the baselines only the weight "
         "of Joint's and Separate's symbols was tuned.\n",
