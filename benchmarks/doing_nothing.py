@@ -3,7 +3,7 @@
     python -m benchmarks.doing_nothing
 
 Stands still for an episode from each of some fresh starts of each task, those of `python -m benchmarks.paper`, and
-writes `benchmarks/results/doing_nothing.json`.
+writes what it measured into `benchmarks/results/doing_nothing.json`.
 """
 
 import argparse
@@ -41,10 +41,12 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=100)
     options = parser.parse_args()
     run = describe_run()
-    scores = {task: round(mean_score(HDPEnv(**ENVS[task]), options.starts), 4) for task in options.tasks}
-    result = {"starts": options.starts, "mean_score": scores}
-    FILE.write_text(json.dumps({"run": run, "result": result}, indent=2) + "\n")
-    print(json.dumps(result, indent=2))
+    results = json.loads(FILE.read_text()) if FILE.exists() else {}
+    for task in options.tasks:
+        score = mean_score(HDPEnv(**ENVS[task]), options.starts)
+        results[task] = {"run": run, "starts": options.starts, "mean_score": round(score, 4)}
+        FILE.write_text(json.dumps(results, indent=2) + "\n")
+        print(f"{task}: {score:.4f}", flush=True)
 
 
 if __name__ == "__main__":

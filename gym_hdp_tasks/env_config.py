@@ -1,7 +1,7 @@
 """`--env.type=hdp`: LeRobot's view of the tasks."""
 
 from dataclasses import dataclass, fields, replace
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any
 
 from draccus.utils import ParsingError
@@ -101,8 +101,7 @@ class HDPEnv(EnvConfig):
         """
         if self.task not in TASKS:
             raise ValueError(f"--env.task={self.task} is not a task of --env.type=hdp; choose one of {list(TASKS)}")
-        module, function = TASKS[self.task].split(":")
-        return getattr(import_module(module), function)(**self._task_parameters)
+        return resolve_name(TASKS[self.task])(**self._task_parameters)
 
     @property
     def _task_parameters(self) -> dict[str, Any]:

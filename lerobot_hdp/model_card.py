@@ -54,5 +54,5 @@ def describe_planner(card: ModelCard, config: HDPConfig, fps: int | None, env: E
 def _say_what_is_executed(config: HDPConfig, fps: int | None) -> str:
     if config.plan_from == "any_frame":
         return f"The robot executes {config.n_action_steps or 'all'} of them before it plans again."
-    end = f": `--fps={fps} --duration={config.horizon / fps:.1f}`" if fps else ""
-    return f"They are a whole episode, executed without another look. In `lerobot-rollout`, end there{end}."
+    rate = f"at {fps} a second (`lerobot-rollout --fps={fps}`)" if fps else "at the rate of the dataset"
+    return f"They are a whole episode, executed {rate} without another look; then the last one is held."

@@ -160,7 +160,7 @@ class HDPPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Forget the plan in execution. To be called on `env.reset()`."""
         self._queue: deque[Tensor] = deque()
-        self._has_planned = False
+        self._last_action: Tensor | None = None
 
     def update(self) -> None:
         """Move the averaged weights. LeRobot calls this after each optimiser step."""
@@ -467,21 +467,23 @@ class HDPPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
         """The next action of the plan, after making one if there is none: (B, D).
 
+        A planner of whole episodes plans once, and then holds the last action until `reset`.
+
         Warns:
-            UserWarning: a planner of whole episodes has come to the end of its plan, and plans again, from where it is.
+            UserWarning: it has come to the end of its plan.
         """
         self.eval()
+        if not self._queue and self._last_action is not None and self.config.plan_from == "episode_start":
+            warnings.warn(
+                f"the plan of {self.config.horizon} actions has ended, and its last one is held: end the episode, and "
+                "before the next one, call reset(). To plan again, train with --policy.plan_from=any_frame.",
+                stacklevel=2,
+            )
+            return self._last_action
         if not self._queue:
-            if self._has_planned and self.config.plan_from == "episode_start":
-                warnings.warn(
-                    f"the plan of {self.config.horizon} actions has ended, and another is made from here, where a "
-                    "planner of whole episodes has learned nothing. End the episode, or train with "
-                    "--policy.plan_from=any_frame; before each episode, call reset().",
-                    stacklevel=2,
-                )
-            self._has_planned = True
             self._queue.extend(self.predict_action_chunk(batch).unbind(dim=1))
-        return self._queue.popleft()
+        self._last_action = self._queue.popleft()
+        return self._last_action
 
     @property
     def _planning_network(self) -> Planner:

@@ -147,11 +147,7 @@ def widen_narrow_ranges(config: HDPConfig, stats: dict[str, dict[str, Any]]) -> 
         stats: of a dataset; the `min` and `max` of observations are changed.
     """
     for key, feature in config.input_features.items():
-        if config.normalization_mapping.get(feature.type.value) is not NormalizationMode.MIN_MAX:
-            continue
-        if key not in stats:
-            if stats:
-                logging.warning("%s is not normalised, for want of statistics: train with hdp-train", key)
+        if config.normalization_mapping.get(feature.type.value) is not NormalizationMode.MIN_MAX or key not in stats:
             continue
         low, high = (np.asarray(stats[key][bound]) for bound in ("min", "max"))
         middle, half = (low + high) / 2, (high - low) / 2

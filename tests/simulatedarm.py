@@ -25,7 +25,8 @@ class SimulatedArmConfig(RobotConfig):
 class SimulatedArm(Robot):
     """One arm; its `sent` are the waypoints that it was sent, and its `seen` the first image of each camera.
 
-    Connecting it resets the scene to seed 0, and PyTorch's generator, so that a test can make the same plan.
+    Connecting it resets the scene to seed 0, and PyTorch's generator, so that a test can make the same plan. When the
+    episode is over, it acts as a user who presses Ctrl-C.
     """
 
     config_class = SimulatedArmConfig
@@ -59,12 +60,15 @@ class SimulatedArm(Robot):
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         self.sent.append(np.array([action[name] for name in self.action_features], dtype=np.float32))
-        observation, *_ = self.env.step(self.sent[-1])
+        observation, _, terminated, truncated, _ = self.env.step(self.sent[-1])
         self.pixels = observation["pixels"]
+        if terminated or truncated:
+            raise KeyboardInterrupt
         return action
 
     def calibrate(self) -> None: ...
 
     def configure(self) -> None: ...
 
-    def disconnect(self) -> None: ...
+    def disconnect(self) -> None:
+        self.env.close()

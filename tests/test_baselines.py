@@ -121,7 +121,7 @@ class TestContract:
         assert {"lerobot", "robotics", planner, "xarm"} == set(card.data.tags)
         assert card.content.count("# Model Card for") == 1
         assert "From one observation it plans 19 actions" in card.content
-        assert "`--fps=10 --duration=1.9`" in card.content
+        assert "lerobot-rollout --fps=10" in card.content
         assert "`lerobot_policy_hdp`" in card.content
         assert "| `observation.environment_state` |" in card.content
         prompts = re.findall(r'`--policy.prompt="(.+)"`', card.content)

@@ -259,17 +259,18 @@ def test_a_smaller_n_action_steps_replans(make_planner, batch):
     assert len(calls) == 3 * policy.config.num_train_timesteps
 
 
-def test_going_on_after_the_end_of_a_whole_plan_is_warned_of(make_planner, batch):
+def test_the_last_action_of_a_whole_plan_is_held_with_a_warning(make_planner, batch):
     policy, preprocessor, _ = make_planner()
     inputs = observation(preprocessor(batch))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(2):
             policy.reset()
-            for _ in range(HORIZON):
-                policy.select_action(inputs)
-    with pytest.warns(UserWarning, match="the plan of 19 actions has ended"):
-        policy.select_action(inputs)
+            actions = [policy.select_action(inputs) for _ in range(HORIZON)]
+    assert not torch.equal(actions[-1], actions[-2])
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="the plan of 19 actions has ended"):
+            assert torch.equal(policy.select_action(inputs), actions[-1])
 
 
 def test_any_frame_trains_on_what_remains(make_planner, dataset):

@@ -17,6 +17,8 @@ from lerobot.datasets.dataset_tools import delete_episodes
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from benchmarks import cells, checkpoints, few_step_planning
+from benchmarks.paper.presets import PRESETS
 from dataset_tools import record as recorder
 from dataset_tools import record_on_cluster as cluster
 from dataset_tools.experts import EXPERTS
@@ -233,8 +235,8 @@ def test_a_worker_that_is_killed_ends_the_recording_with_one_line(tmp_path):
     while not list((tmp_path / "stopped.partial").glob("*.done")):
         assert process.poll() is None
         time.sleep(0.01)
-    children = psutil.Process(process.pid).children(recursive=True)
-    max(children, key=lambda child: child.cpu_times().user).kill()
+    workers = [worker for child in psutil.Process(process.pid).children() for worker in child.children()]
+    workers[0].kill()  # the children are servers of Python's, the workers theirs
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "Traceback" not in stderr
@@ -245,8 +247,9 @@ def test_no_recorded_start_is_one_that_is_evaluated():
     recorded = {
         episode_seed(seed, episode, attempt) for seed in (0, 1, 2) for episode in range(4_000) for attempt in (0, 1)
     }
-    evaluated = {first + number for first in (0, 1_000_000, 2_000_000, 3_000_000) for number in range(2_000)}
-    assert not recorded & evaluated
+    firsts = (0, cells.FIRST_EVALUATION_SEED, few_step_planning.FIRST_SEED, checkpoints.FIRST_SEED)
+    most = max(preset.evaluations * preset.starts for preset in PRESETS.values())
+    assert not recorded & {first + number for first in firsts for number in range(most)}
 
 
 def test_the_command_goes_on_with_an_interrupted_recording_only_when_told_to(tmp_path):

@@ -127,7 +127,7 @@ def simulation(preset: str, titles: dict[str, str], results: Results) -> str:
         how = settings.tasks[task]
         words.append(
             f"{title}: {how.demonstrations:,} demonstrations, {how.steps:,} steps of {how.batch_size}"
-            f"{options(how.policy)}{options(settings.hdp_policy | how.hdp_policy, 'HDP with ')}"
+            f"{differences(how.policy)}{differences(settings.hdp_policy | how.hdp_policy, 'HDP with ')}"
         )
     return (
         f"### {TITLES[preset]} (`--preset {preset}`)\n\n{markdown_table(header, rows)}\n{'; '.join(words)}. "
@@ -135,18 +135,16 @@ def simulation(preset: str, titles: dict[str, str], results: Results) -> str:
     )
 
 
-def options(policy: dict[str, Any], of: str = "") -> str:
-    """What differs from a preset, in words; nothing, if nothing does."""
+def differences(policy: dict[str, Any], whose: str = "") -> str:
+    """Options that differ from a preset's, in words; nothing, if none do."""
     values = {name: f"{value:.3g}" if isinstance(value, float) else value for name, value in policy.items()}
-    return f", {of}`{', '.join(f'{name}={value}' for name, value in values.items())}`" if policy else ""
+    return f", {whose}`{', '.join(f'{name}={value}' for name, value in values.items())}`" if policy else ""
 
 
 def floor(titles: dict[str, str]) -> str:
     """The mean scores of doing nothing."""
-    if not doing_nothing.FILE.exists():
-        return ""
-    measured = json.loads(doing_nothing.FILE.read_text())["result"]["mean_score"]
-    scores = ", ".join(f"{title}: {100 * measured[task]:.0f} %" for task, title in titles.items())
+    measured = json.loads(doing_nothing.FILE.read_text())
+    scores = ", ".join(f"{title}: {100 * measured[task]['mean_score']:.0f} %" for task, title in titles.items())
     return f"A robot that stays where it is has a mean score, too ({scores}; `python -m benchmarks.doing_nothing`)."
 
 

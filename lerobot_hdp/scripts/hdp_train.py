@@ -1,8 +1,9 @@
 """`hdp-train`: LeRobot's own training, with the dataset in memory, for any policy and any dataset that fits.
 
 Takes all flags of `lerobot-train`, and does what it does with them, from checkpoints to `--resume` and `accelerate
-launch`: it runs LeRobot's training function. Beyond that, planners of whole episodes train on episodes shorter than
-their plans, too, and their held-out loss is that of whole plans.
+launch`: it runs LeRobot's training function. Beyond that, it normalises observations that
+`--rename_map` renames; planners of whole episodes train on episodes shorter than their plans, too, and their held-out
+loss is that of whole plans.
 
 What it changes are some names in LeRobot's module, below, where LeRobot 0.6.1 has no hook: the functions that open the
 datasets, collate a batch with language columns, write a checkpoint and submit a job, for planners of whole episodes the
@@ -26,7 +27,6 @@ import torch
 from lerobot.configs import FeatureType
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
-from lerobot.processor.rename_processor import rename_stats
 from lerobot.scripts import lerobot_train
 from lerobot.utils.collate import lerobot_collate_fn
 from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -53,8 +53,6 @@ def hold_datasets_in_memory(max_gib: float) -> None:
         users_num_workers = cfg.num_workers
         train_and_eval = make_datasets(cfg)
         opened = [dataset for dataset in train_and_eval if dataset is not None]
-        # LeRobot renames observations before it normalises them, but not their statistics.
-        opened[0].meta.stats |= rename_stats(opened[0].meta.stats, cfg.rename_map)
         leave_out = _unused_cameras(cfg, opened[0].meta.features) if isinstance(cfg.policy, HDPConfig) else []
         first_images_only = _plans_whole_episodes(cfg)
         if (reason := _why_not_in_memory(opened, leave_out, first_images_only, max_gib)) is not None:
@@ -74,6 +72,19 @@ def hold_datasets_in_memory(max_gib: float) -> None:
     lerobot_train.make_train_eval_datasets = make_datasets_in_memory
     lerobot_train.save_checkpoint = save_with_users_num_workers
     lerobot_train.lerobot_collate_fn = collate_unless_collated
+
+
+def normalise_renamed_observations() -> None:
+    """Let statistics follow `--rename_map`: LeRobot renames observations before it normalises them, and not these."""
+    make_datasets = lerobot_train.make_train_eval_datasets
+
+    def make_datasets_with_renamed_stats(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
+        train, held_out = make_datasets(cfg)
+        stats = train.meta.stats or {}
+        train.meta.stats = stats | {new: dict(stats[old]) for old, new in cfg.rename_map.items() if old in stats}
+        return train, held_out
+
+    lerobot_train.make_train_eval_datasets = make_datasets_with_renamed_stats
 
 
 class FirstFrameSampler(EpisodeAwareSampler):
@@ -237,6 +248,7 @@ def main() -> None:
     if "--help" in sys.argv or "-h" in sys.argv:
         parser.print_help()
     lerobot_train.submit_to_hf = refuse_to_submit
+    normalise_renamed_observations()
     hold_datasets_in_memory(options.max_memory_gib)
     start_where_plans_begin()
     process_group = hold_process_group()
