@@ -132,7 +132,8 @@ two settings. At the preset's width of 256 only the learning rate has been compa
 
 ## Today's preset
 
-The planners of [`small`](results.md), and what one change makes of them. (`lead_share` is 0 but in arranging.)
+The planners of [`small`](results.md), and what one change makes of them. (`lead_share` is 0 but in arranging. The last
+row is HDP but for the process of its symbols, which is Gaussian, and the weight of their loss.)
 
 """
 
