@@ -322,16 +322,21 @@ class TestContract:
             policy.eval().plan(inputs)
 
 
+@pytest.mark.parametrize("planner", [*CONTINUOUS_SYMBOLS, *HIERARCHICAL])
+def test_candidates_cannot_be_compared(make_planner, batch, planner):
+    with pytest.raises(ValueError, match="cannot score its plans"):
+        make_planner(planner, num_candidates=2)
+    policy, preprocessor, _ = make_planner(planner)
+    with pytest.raises(ValueError, match="cannot score its plans"):
+        policy.eval().plan(observation(preprocessor(batch)), num_candidates=2)
+
+
 @pytest.mark.parametrize("planner", CONTINUOUS_SYMBOLS)
 class TestContinuousSymbols:
     def test_a_plan_prints_as_words(self, make_planner, batch, planner):
         policy, preprocessor, _ = make_planner(planner)
         plan = policy.eval().plan(observation(preprocessor(batch)))
         assert plan.describe(0).split() == plan.symbols(0)
-
-    def test_candidates_cannot_be_compared(self, make_planner, planner):
-        with pytest.raises(ValueError, match="cannot score its plans"):
-            make_planner(planner, num_candidates=2)
 
     def test_given_symbols_stay_fixed_in_every_step_but_for_their_noise(self, make_planner, batch, planner):
         policy, preprocessor, _ = make_planner(planner)
