@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from .task import CAMERAS, OBS_TYPES, PlanningTask
+from .task import CAMERAS, OBS_TYPES, PlanningTask, are_cameras
 
 TASKS = {
     "BlockSorting2D-v0": "gym_hdp_tasks.block_sorting_2d:block_sorting_2d_task",
@@ -65,7 +65,7 @@ class HDPEnv(EnvConfig):
         if self.obs_type not in OBS_TYPES:
             raise ParsingError(f"--env.obs_type must be one of {OBS_TYPES}, got {self.obs_type!r}")
         self.camera_names = tuple(self.camera_names)
-        if not 0 < len(self.camera_names) == len(set(self.camera_names) & set(CAMERAS)):
+        if not are_cameras(self.camera_names):
             raise ParsingError(f"--env.camera_names is a list, as [front], of {CAMERAS}, got {self.camera_names}")
         if self.obs_type == "state" and self.camera_names != CAMERAS:
             raise ParsingError("--env.camera_names chooses among images: add --env.obs_type=pixels, or pixels_state")

@@ -8,6 +8,7 @@ from .plan_rules import Observation
 
 FRONT_CAMERA, WRIST_CAMERA = CAMERAS = ("front", "wrist")
 OBS_TYPES = ("state", "pixels", "pixels_state")
+"""What an X-Arm task can observe, and by which cameras."""
 PAD = "PAD"
 """Symbol with id 0: fills a plan that is shorter than the symbolic horizon."""
 
@@ -52,6 +53,11 @@ class PlanningTask:
             raise ValueError(f"the first symbol of a vocabulary is {PAD}, got {self.vocabulary[0]!r}")
         if len(set(self.vocabulary)) != len(self.vocabulary):
             raise ValueError(f"a vocabulary names each symbol once, got {self.vocabulary}")
+
+
+def are_cameras(names: Sequence[str]) -> bool:
+    """Whether these are some of `CAMERAS`, each once."""
+    return 0 < len(names) == len(set(names) & set(CAMERAS))
 
 
 def equal_steps(steps: int, tokens: int, waypoints: int) -> tuple[tuple[int, int], ...]:

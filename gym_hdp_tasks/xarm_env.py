@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from .scene import BLOCK_HALF_SIZE, FRONT_CAMERA_FOVY, furnish
-from .task import CAMERAS, FRONT_CAMERA, OBS_TYPES, PlanningTask
+from .task import CAMERAS, FRONT_CAMERA, OBS_TYPES, PlanningTask, are_cameras
 from .waypoint_motion import WaypointMotion
 from .xarm7 import ARM_JOINTS, GRIPPERS, ROBOT_CONTYPE, TCP_SITE, robot_spec
 
@@ -82,7 +82,7 @@ class XArmEnv(gym.Env):
     ):
         if obs_type not in OBS_TYPES:
             raise ValueError(f"obs_type must be one of {OBS_TYPES}, got {obs_type!r}")
-        if not 0 < len(camera_names) == len(set(camera_names) & set(CAMERAS)):
+        if not are_cameras(camera_names):
             raise ValueError(f"camera_names must name some of {CAMERAS}, each once, got {tuple(camera_names)}")
         if min(camera_height, camera_width) < 1:
             raise ValueError(f"a camera image has at least 1 pixel, got {camera_height} x {camera_width}")

@@ -267,7 +267,7 @@ class HDPConfig(PreTrainedConfig):
         if self.horizon and self.n_action_steps and self.n_action_steps != self.horizon:
             if self.n_action_steps > self.horizon:
                 raise ParsingError(f"n_action_steps={self.n_action_steps} is more than the plan has ({self.horizon=})")
-            if self.plan_from == "episode_start":
+            if self.plans_whole_episodes:
                 raise ParsingError(
                     f"n_action_steps={self.n_action_steps} of {self.horizon} plans again in the middle of an episode, "
                     "which a planner of whole episodes has not seen: train with plan_from=any_frame, or leave it out"
@@ -373,9 +373,14 @@ class HDPConfig(PreTrainedConfig):
             raise ValueError("a planner learns its sizes and its vocabulary from a dataset: train it before use")
 
     @property
+    def plans_whole_episodes(self) -> bool:
+        """Whether a plan is a whole episode, from its first frame; else what is left of one, from any frame."""
+        return self.plan_from == "episode_start"
+
+    @property
     def drop_n_last_frames(self) -> int:
         """Frames at an episode's end that no training sample starts from: for LeRobot's sampler."""
-        return self._known_horizon - 1 if self.plan_from == "episode_start" else 0
+        return self._known_horizon - 1 if self.plans_whole_episodes else 0
 
     @property
     def observation_delta_indices(self) -> None:

@@ -52,7 +52,7 @@ def describe_planner(card: ModelCard, config: HDPConfig, fps: int | None, env: E
 
 
 def _say_what_is_executed(config: HDPConfig, fps: int | None) -> str:
-    if config.plan_from == "any_frame":
+    if not config.plans_whole_episodes:
         return f"The robot executes {config.n_action_steps or 'all'} of them before it plans again."
     rate = f"at {fps} a second (`lerobot-rollout --fps={fps}`)" if fps else "at the rate of the dataset"
     return f"They are a whole episode, executed {rate} without another look; then the last one is held."

@@ -125,7 +125,7 @@ class HDPPolicy(PreTrainedPolicy):
         widen_narrow_ranges(config, dataset_stats or {})
         if config.num_candidates > 1:
             self._check_can_score()
-        if dataset_meta is not None and config.plan_from == "episode_start":
+        if dataset_meta is not None and config.plans_whole_episodes:
             _check_episodes_fit(config, dataset_meta.episodes["length"])
         self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
         self.motion_process, self.symbol_process = make_processes(config)
@@ -203,7 +203,7 @@ class HDPPolicy(PreTrainedPolicy):
         streams all frames of a dataset, whatever `drop_n_last_frames` says.
         """
         timestamp = batch.get("timestamp")
-        if self.config.plan_from != "episode_start" or timestamp is None:
+        if not self.config.plans_whole_episodes or timestamp is None:
             return False
         return bool((timestamp > 0).any())
 
@@ -473,7 +473,7 @@ class HDPPolicy(PreTrainedPolicy):
             UserWarning: it has come to the end of its plan.
         """
         self.eval()
-        if not self._queue and self._last_action is not None and self.config.plan_from == "episode_start":
+        if not self._queue and self._last_action is not None and self.config.plans_whole_episodes:
             warnings.warn(
                 f"the plan of {self.config.horizon} actions has ended, and its last one is held: end the episode, and "
                 "before the next one, call reset(). To plan again, train with --policy.plan_from=any_frame.",

@@ -103,7 +103,7 @@ PRESETS: dict[str, Preset] = {
         policy={"preset": "default", "dtype": "bfloat16", "optimizer_lr": 1e-3},
         tasks={
             "xarm_sorting": Training(200, 2_400, 50, {**_SMALL_LR, **_AT_FIRST_THRESHOLD}),
-            "xarm_arrange_blocks": Training(4_000, 3_000, 50, _AT_FIRST_THRESHOLD, _MANY_DEMONSTRATIONS),
+            "xarm_arrange_blocks": Training(4_000, 3_000, 50, _AT_FIRST_THRESHOLD, hdp_policy=_MANY_DEMONSTRATIONS),
             "xarm_tool_use": Training(400, 2_000, 50, {**_SMALL_LR, **_AT_FIRST_THRESHOLD}),
             **_TASKS_2D,
         },
@@ -187,7 +187,7 @@ def complete(policy: dict[str, Any], env: dict[str, Any]) -> dict[str, Any]:
     unused = {"type"}
     if config.symbol_process != "masked":
         unused |= {"confidence_threshold"}
-        if not policy.get("symbol_lead"):
+        if not policy.get("symbol_lead"):  # Gaussian symbols lead only where a cell says so
             unused |= {"symbol_lead"}
     if config.symbol_process is None:
         unused |= {"symbolic_horizon", "symbol_loss_weight"}

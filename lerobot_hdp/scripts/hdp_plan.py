@@ -274,7 +274,7 @@ def _check_task(planner: HDPConfig, task: Any) -> None:
     """Refuse a task (`planning_task` of an environment's configuration) for which the planner was not made."""
     features = planner.input_features
     facts = {
-        "horizon": (planner.horizon if planner.plan_from == "episode_start" else None, task.horizon),
+        "horizon": (planner.horizon if planner.plans_whole_episodes else None, task.horizon),
         "vocabulary": (planner.vocabulary and " ".join(planner.vocabulary), " ".join(task.vocabulary)),
         "number of state components": (_size(features, OBS_STATE), len(task.state_names)),
         "number of objects' components": (_size(features, OBS_ENV_STATE), len(task.environment_state_names)),

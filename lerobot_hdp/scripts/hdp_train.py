@@ -151,7 +151,7 @@ def hold_process_group() -> list[ProcessGroup]:
 
 def _plans_whole_episodes(cfg: TrainPipelineConfig) -> bool:
     """Whether the policy is trained on the first frames of episodes alone."""
-    return isinstance(cfg.policy, HDPConfig) and cfg.policy.plan_from == "episode_start"
+    return isinstance(cfg.policy, HDPConfig) and cfg.policy.plans_whole_episodes
 
 
 def _unused_cameras(cfg: TrainPipelineConfig, features: dict[str, dict]) -> list[str]:
