@@ -1,20 +1,24 @@
-"""LeRobot's language columns, made of the plan that a dataset carries.
+"""LeRobot's language columns, made of the plan that a dataset carries, and plans made of such columns.
 
 An episode's `language_persistent` is a list of rows, each with a style, a text and the time from which it holds until
 the next row of that style. `subtask` rows say which step is being done, `plan` rows what is left to do. LeRobot's
 readers (`lerobot.datasets.language_render`) find the row that is active at a frame.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import datasets
 import numpy as np
 import pyarrow.parquet as pq
+from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import load_info, write_info, write_table_one_row_group_per_episode
 from lerobot.datasets.language import LANGUAGE_EVENTS, LANGUAGE_PERSISTENT, language_feature_info
+
+from .demonstration import PlanStep
 
 SYMBOLIC_PLAN = "observation.symbolic_plan"
 DONE_TEXT = "done"
@@ -93,3 +97,37 @@ def language_rows(plans: np.ndarray, timestamps: np.ndarray, vocabulary: Sequenc
                 }
             )
     return rows
+
+
+def plans_of_subtasks(dataset: LeRobotDataset, words: Mapping[str, str]) -> list[list[PlanStep]]:
+    """The plan of each episode, from its `subtask` rows, as `lerobot-annotate` writes them: for `add_symbolic_plans`.
+
+    A subtask is done where the next one begins, the last one at the end of the episode.
+
+    Args:
+        dataset: with the column `language_persistent`.
+        words: for each text, the symbols of the step, separated by spaces, such as `{"pick up the cup": "PICK CUP"}`.
+            A text with no symbols (`""`) is no step, such as waiting, or moving back when all is done.
+
+    Raises:
+        ValueError: the dataset has no such rows, or texts without words, all of which the message names.
+    """
+    if LANGUAGE_PERSISTENT not in dataset.meta.features:
+        raise ValueError(f"{dataset.repo_id} has no column {LANGUAGE_PERSISTENT}: annotate it with lerobot-annotate")
+    frames = dataset.hf_dataset.with_format(None)
+    episode_indices = np.array(frames["episode_index"])
+    starts = np.flatnonzero(np.diff(episode_indices, prepend=-1))
+    plans, unknown = [], Counter[str]()
+    for start, stop in zip(starts.tolist(), [*starts[1:].tolist(), len(frames)], strict=True):
+        rows = [row for row in frames[start][LANGUAGE_PERSISTENT] if row["style"] == "subtask"]
+        if not rows:
+            raise ValueError(f"episode {episode_indices[start]} has no rows of style subtask")
+        rows.sort(key=lambda row: row["timestamp"])
+        stops = [round(row["timestamp"] * dataset.fps) for row in rows[1:]] + [stop - start]
+        unknown.update(row["content"] for row in rows if row["content"] not in words)
+        steps = [(tuple(words.get(row["content"], "").split()), end) for row, end in zip(rows, stops, strict=True)]
+        plans.append([PlanStep(symbols, end) for symbols, end in steps if symbols])
+    if unknown:
+        texts = ", ".join(f"{text!r} ({count})" for text, count in unknown.most_common())
+        raise ValueError(f"say the words of each subtask; there are none for {texts}")
+    return plans

@@ -14,9 +14,9 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from safetensors.torch import load_file
 
 from dataset_tools import record as recorder
-from dataset_tools.demonstration import expert_generator
+from dataset_tools.demonstration import PlanStep, expert_generator
 from dataset_tools.experts import EXPERTS
-from dataset_tools.language import write_language_columns
+from dataset_tools.language import plans_of_subtasks, write_language_columns
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, episode_seed, record
 from dataset_tools.replay import load_recording, replay
 from gym_hdp_tasks.env_config import HDPEnv
@@ -118,12 +118,20 @@ def test_replaying_the_actions_from_the_seed_gives_the_recorded_score(dataset, t
     assert max(replay(never_open)) < 1.0
 
 
-def test_language_columns_say_which_step_is_being_done(dataset):
+@pytest.fixture(scope="module")
+def expert_steps() -> list[list[PlanStep]]:
+    """What the expert does in the episodes of `dataset`."""
     env = gym.make(SORTING.gym_id, disable_env_checker=True)
+    plans = []
     for index in range(N_EPISODES):
         seed = episode_seed(0, index)
         env.reset(seed=seed)
-        steps = EXPERTS[SORTING.gym_id](env, expert_generator(seed)).steps
+        plans.append(list(EXPERTS[SORTING.gym_id](env, expert_generator(seed)).steps))
+    return plans
+
+
+def test_language_columns_say_which_step_is_being_done(dataset, expert_steps):
+    for index, steps in enumerate(expert_steps):
         for number, frame in enumerate(episode_of(dataset, index)):
             left = [" ".join(step.symbols) for step in steps if step.stop > number] or ["done"]
             rows, time = frame["language_persistent"], frame["timestamp"].item()
@@ -133,6 +141,27 @@ def test_language_columns_say_which_step_is_being_done(dataset):
             assert frame["language_events"] == []
     with pytest.raises(ValueError, match="already"):
         write_language_columns(dataset.root, SORTING.planning_task.vocabulary)
+
+
+def test_plans_are_made_of_subtasks(dataset, expert_steps):
+    texts = {" ".join(step.symbols) for steps in expert_steps for step in steps}
+    words = {text: text for text in texts}
+    assert plans_of_subtasks(dataset, {**words, "done": ""}) == expert_steps
+    only_the_second = LeRobotDataset(dataset.repo_id, dataset.root, episodes=[1])
+    assert plans_of_subtasks(only_the_second, {**words, "done": ""}) == expert_steps[1:]
+
+    waits = plans_of_subtasks(dataset, {**words, "done": "WAIT"})
+    horizon = dataset.meta.episodes["length"][0]
+    assert waits == [[*steps, PlanStep(("WAIT",), horizon)] for steps in expert_steps]
+
+    with pytest.raises(ValueError, match=r"there are none for 'done' \(2\)"):
+        plans_of_subtasks(dataset, words)
+
+
+def test_a_dataset_without_subtasks_says_so(tmp_path):
+    without = record(config(tmp_path / "without", HDPEnv(task=ARRANGE.task), num_episodes=1))
+    with pytest.raises(ValueError, match="test/cameras has no column language_persistent: annotate it"):
+        plans_of_subtasks(without, {})
 
 
 def test_cameras_that_a_task_cannot_have_are_refused_before_anything_is_written(tmp_path):
