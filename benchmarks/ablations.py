@@ -11,7 +11,7 @@ on. The page holds all finished cells, whatever was chosen to be run.
 import argparse
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from statistics import mean
 from typing import Any
@@ -20,16 +20,17 @@ from lerobot.configs import PreTrainedConfig
 
 from .cells import Cell, points_that_count, read_result, run_cells
 from .pages import DOCS, markdown_table
-from .paper.presets import PRESETS, complete, make_cell
+from .paper.presets import complete, exists, make_cell
 
 PAGE = DOCS / "ablations.md"
 TASKS = {
     "3_blocks": "block_sorting_2d_3_blocks",
     "4_blocks": "block_sorting_2d_4_blocks",
+    "sorting": "xarm_sorting",
     "arrange": "xarm_arrange_blocks",
     "tool_use": "xarm_tool_use",
 }
-"""What a cell's name begins with, and the task of the `mini` preset."""
+"""What a cell's name begins with, and the task of the preset."""
 SEEDS = (0, 1)
 NOISE = {"prediction_type": "epsilon", "optimizer_lr": 5e-4}
 """Noise prediction, at the learning rate of the preset `mini_epsilon`."""
@@ -74,19 +75,67 @@ CHANGES: dict[str, dict[str, Any]] = {
     "type=separate_diffuser, symbol_loss_weight=3.2": {"type": "separate_diffuser", "symbol_loss_weight": 3.2},
 }
 """Of the planner of `mini`."""
-EARLIER: dict[str, tuple[str, dict[str, Any]]] = {
-    "rotary=false": ("mini", {}),
-    "prediction_type=epsilon, symbol_loss_weight=1/30": ("mini_epsilon", {}),
-    **{name: ("mini", changes) for name, changes in CHANGES.items()},
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A planner of the paper's tables, with one change or two; with none, it is a cell of these.
+
+    Attributes:
+        preset, method: of the planner.
+        changes: of its options.
+        steps: times those of the preset.
+    """
+
+    preset: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    method: str = "hdp"
+    steps: int = 1
+
+    def base(self, task: str, seed: int) -> Cell:
+        return make_cell(self.preset, TASKS[task], self.method, seed)
+
+    def cell(self, name: str, task: str, seed: int) -> Cell:
+        """The cell of one of `TASKS` and a seed.
+
+        Raises:
+            KeyError: the preset has no such task.
+        """
+        base = self.base(task, seed)
+        if not self.changes and self.steps == 1:
+            return base
+        return replace(
+            base,
+            group="ablations",
+            name=f"{task}_{name.replace(', ', '_').replace('/', '_')}_seed{seed}",
+            policy=complete({**base.policy, **self.changes}, base.env),
+            steps=self.steps * base.steps,
+            facts={"variant": name},
+        )
+
+
+EARLIER = {
+    "rotary=false": Variant("mini"),
+    "prediction_type=epsilon, symbol_loss_weight=1/30": Variant("mini_epsilon"),
+    **{name: Variant("mini", changes) for name, changes in CHANGES.items()},
 }
-TODAYS: dict[str, tuple[str, dict[str, Any]]] = {
-    "unchanged": ("small", {}),
-    "lead_share=0": ("small", {"lead_share": 0.0}),
+TODAYS = {
+    "unchanged": Variant("small"),
+    "lead_share=0": Variant("small", {"lead_share": 0.0}),
     # HDP but for the symbols' process, whose loss has a scale of its own.
-    "type=separate_diffuser": ("small", {"type": "separate_diffuser", "symbol_loss_weight": 0.1}),
+    "type=separate_diffuser": Variant("small", {"type": "separate_diffuser", "symbol_loss_weight": 0.1}),
+    "steps=2x": Variant("small", steps=2),
 }
-VARIANTS = {**EARLIER, **TODAYS}
-"""For each variant a preset of the paper's tables and what is changed of it; with no change, it is a cell of these."""
+OF_DIFFUSER = {
+    "diffuser": Variant("small", method="diffuser"),
+    "diffuser, optimizer_lr=1e-3": Variant("small", {"optimizer_lr": 1e-3}, "diffuser"),
+    "diffuser, steps=2x": Variant("small", method="diffuser", steps=2),
+}
+OF_LARGE_DIFFUSER = {
+    "large diffuser": Variant("default", method="diffuser"),
+    "large diffuser, optimizer_lr=1e-3": Variant("default", {"optimizer_lr": 1e-3}, "diffuser"),
+}
+VARIANTS = {**EARLIER, **TODAYS, **OF_DIFFUSER, **OF_LARGE_DIFFUSER}
 WHAT_FOLLOWS = """
 The first row was the base when this table was begun. What has become the `default` preset since:
 
@@ -132,40 +181,34 @@ two settings. At the preset's width of 256 only the learning rate has been compa
 
 ## Today's preset
 
-The planners of [`small`](results.md), and what one change makes of them. (`lead_share` is 0 but in arranging. The last
-row is HDP but for the process of its symbols, which is Gaussian, and the weight of their loss.)
+The planners of [`small`](results.md), and what one change makes of them. (`lead_share` is 0 but in arranging.
+`type=separate_diffuser` is HDP but for the process of its symbols, which is Gaussian, and the weight of their loss;
+`steps=2x` is trained twice as long.)
 
 """
+ABOUT_DIFFUSER = """
+## Would other settings make Diffuser better?
 
+All settings were chosen by HDP's success. These are Diffuser's, as in [`small`](results.md), and with a lower learning
+rate or twice the steps.
 
-def variant_of(name: str, task: str, seed: int) -> Cell:
-    """The cell of a variant, one of `TASKS` and a seed.
+"""
+ABOUT_LARGE_DIFFUSER = """
+The same at the paper's network size, where sorting and tool use have the learning rate of the small network, 3e-3, and
+arranging has 1e-3:
 
-    Raises:
-        KeyError: the variant's preset has no such task.
-    """
-    preset, changes = VARIANTS[name]
-    cell = make_cell(preset, TASKS[task], "hdp", seed)
-    if not changes:
-        return cell
-    return replace(
-        cell,
-        group="ablations",
-        name=f"{task}_{name.replace(', ', '_').replace('/', '_')}_seed{seed}",
-        policy=complete({**cell.policy, **changes}, cell.env),
-        facts={"variant": name},
-    )
+"""
 
 
 def variants(names: Iterable[str], tasks: Iterable[str], seeds: Iterable[int]) -> dict[tuple[str, str, int], Cell]:
     """The cells of these variants, tasks and seeds, of those tasks where the variant's preset has what is changed."""
     found = {}
     for name, task, seed in product(names, tasks, seeds):
-        preset, changes = VARIANTS[name]
-        if TASKS[task] not in PRESETS[preset].tasks:
+        variant = VARIANTS[name]
+        if not exists(variant.method, variant.preset, TASKS[task]):
             continue
-        cell = variant_of(name, task, seed)
-        if not changes or _config(cell) != _config(make_cell(preset, TASKS[task], "hdp", seed)):
+        cell, base = variant.cell(name, task, seed), variant.base(task, seed)
+        if cell == base or (_config(cell), cell.steps) != (_config(base), base.steps):
             found[name, task, seed] = cell
     return found
 
@@ -186,16 +229,17 @@ def write_page() -> None:
 
     def table(names: Iterable[str]) -> str:
         first, *_ = names
-        bases = [cells[first, task, SEEDS[0]] for task in TASKS]
+        tasks = [task for task in TASKS if any(scores[name, task] for name in names)]
         rows = [
-            [f"`{name}`", *(_each(scores[name, task]) for task in TASKS)]
+            [f"`{name}`", *(_each(scores[name, task]) for task in tasks)]
             for name in names
-            if any(scores[name, task] for task in TASKS)
+            if any(scores[name, task] for task in tasks)
         ]
         budget = markdown_table(
-            ["task", "demonstrations", "steps", "samples a step", "layers", "width"], map(_budget, bases)
+            ["task", "demonstrations", "steps", "samples a step", "layers", "width"],
+            (_budget(cells[first, task, SEEDS[0]]) for task in tasks),
         )
-        return f"{budget}\n{markdown_table(['setting', *TASKS.values()], rows)}"
+        return f"{budget}\n{markdown_table(['setting', *(TASKS[task] for task in tasks)], rows)}"
 
     spread = max(max(seeds) - min(seeds) for seeds in scores.values() if seeds)
     base = cells["rotary=false", "3_blocks", SEEDS[0]]
@@ -205,7 +249,14 @@ def write_page() -> None:
         f"evaluations of {base.starts} fresh starts, whose 95 % interval reaches about 5 points to each side; "
         f"two seeds of one setting differ by up to {spread:.0f} points. The "
         "first row has learned positions alone and AdamW; in the others, what is named is changed. "
-        "`python -m benchmarks.ablations`\n\n" + table(EARLIER) + WHAT_FOLLOWS + table(TODAYS)
+        "`python -m benchmarks.ablations`\n\n"
+        + table(EARLIER)
+        + WHAT_FOLLOWS
+        + table(TODAYS)
+        + ABOUT_DIFFUSER
+        + table(OF_DIFFUSER)
+        + ABOUT_LARGE_DIFFUSER
+        + table(OF_LARGE_DIFFUSER)
     )
 
 
@@ -214,8 +265,8 @@ def _each(seeds: list[float]) -> str:
 
 
 def _budget(cell: Cell) -> list[str]:
-    network = cell.policy["num_layers"], cell.policy["width"]
-    numbers = (cell.demonstrations, cell.steps, cell.batch_size, *network)
+    config = _config(cell)
+    numbers = (cell.demonstrations, cell.steps, cell.batch_size, config.num_layers, config.width)
     return [cell.facts["task_name"], *(f"{number:,}" for number in numbers)]
 
 
