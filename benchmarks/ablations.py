@@ -84,13 +84,14 @@ class Variant:
     Attributes:
         preset, method: of the planner.
         changes: of its options.
-        steps: times those of the preset.
+        steps, demonstrations: times those of the preset.
     """
 
     preset: str
     changes: dict[str, Any] = field(default_factory=dict)
     method: str = "hdp"
     steps: int = 1
+    demonstrations: int = 1
 
     def base(self, task: str, seed: int) -> Cell:
         return make_cell(self.preset, TASKS[task], self.method, seed)
@@ -102,13 +103,14 @@ class Variant:
             KeyError: the preset has no such task.
         """
         base = self.base(task, seed)
-        if not self.changes and self.steps == 1:
+        if not self.changes and self.steps == self.demonstrations == 1:
             return base
         return replace(
             base,
             group="ablations",
             name=f"{task}_{name.replace(', ', '_').replace('/', '_')}_seed{seed}",
             policy=complete({**base.policy, **self.changes}, base.env),
+            demonstrations=self.demonstrations * base.demonstrations,
             steps=self.steps * base.steps,
             facts={"variant": name},
         )
@@ -125,11 +127,15 @@ TODAYS = {
     # HDP but for the symbols' process, whose loss has a scale of its own.
     "type=separate_diffuser": Variant("small", {"type": "separate_diffuser", "symbol_loss_weight": 0.1}),
     "steps=2x": Variant("small", steps=2),
+    "demonstrations=4x": Variant("small", demonstrations=4),
+    "separate_diffuser": Variant("small", method="separate_diffuser"),
+    "separate_diffuser, demonstrations=4x": Variant("small", method="separate_diffuser", demonstrations=4),
 }
 OF_DIFFUSER = {
     "diffuser": Variant("small", method="diffuser"),
     "diffuser, optimizer_lr=1e-3": Variant("small", {"optimizer_lr": 1e-3}, "diffuser"),
     "diffuser, steps=2x": Variant("small", method="diffuser", steps=2),
+    "diffuser, demonstrations=4x": Variant("small", method="diffuser", demonstrations=4),
 }
 OF_LARGE_DIFFUSER = {
     "large diffuser": Variant("default", method="diffuser"),
@@ -208,7 +214,7 @@ def variants(names: Iterable[str], tasks: Iterable[str], seeds: Iterable[int]) -
         if not exists(variant.method, variant.preset, TASKS[task]):
             continue
         cell, base = variant.cell(name, task, seed), variant.base(task, seed)
-        if cell == base or (_config(cell), cell.steps) != (_config(base), base.steps):
+        if cell == base or (variant.steps, variant.demonstrations) != (1, 1) or _config(cell) != _config(base):
             found[name, task, seed] = cell
     return found
 
