@@ -5,7 +5,6 @@ import lerobot_hdp.baselines.configuration_ablations
 import lerobot_hdp.baselines.configuration_hierarchical
 import lerobot_hdp.configuration_hdp
 import lerobot_hdp.processor_hdp
-from lerobot_hdp.lerobot_workarounds import keep_data_order_on_resume, shorten_torchcodec_warning
+from lerobot_hdp.lerobot_workarounds import shorten_torchcodec_warning
 
-keep_data_order_on_resume()
 shorten_torchcodec_warning()

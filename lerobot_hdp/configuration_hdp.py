@@ -2,18 +2,18 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, ClassVar
 
 from draccus.utils import ParsingError
 from lerobot.configs import NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_PREFIX, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torchvision.models import get_model_weights
 
-from .encoders import image_feature_size, object_sizes
 from .optimizer import OPTIMIZERS, FusedAdamWConfig, MuonAdamWConfig
 from .processes.gaussian import PREDICTION_TYPES
 from .processes.masked import MASK_SCHEDULES
@@ -115,8 +115,8 @@ class HDPConfig(PreTrainedConfig):
             often and with less weight.
         lead_share: share of the training samples whose motion is pure noise beside symbols at any level, as it is while
             the symbols lead (`symbol_lead`). There the planner decides which of several plans it makes, with nothing to
-            go by but the observation; independent levels show it next to no such samples. It needs thousands of
-            demonstrations: of a few hundred, the planner learns by heart which plan belongs to which start.
+            go by but the observation; independent levels show it next to no such samples. Used with 4,000
+            demonstrations; with few, the planner may learn by heart which plan belongs to which start.
         ema_power, ema_max_decay: the weights that plan are an exponential moving average with the decay
             min(1 - (1 + update)^-ema_power, ema_max_decay), as in Diffusion Policy. `ema_max_decay` 0 switches it off.
 
@@ -222,6 +222,7 @@ class HDPConfig(PreTrainedConfig):
 
     def __post_init__(self):
         super().__post_init__()
+        self._observations_are_chosen = bool(self.input_features)  # else LeRobot lists all that a dataset has
         _check_choice("preset", self.preset, list(PRESETS))
         for name, value in PRESETS[self.preset].items():
             if getattr(self, name) is None:
@@ -298,6 +299,8 @@ class HDPConfig(PreTrainedConfig):
                 f"their meaning: leave out --policy.type, and train on with --policy.path={self.pretrained_path}"
             )
         self.input_features.pop(OBS_SYMBOLIC_PLAN, None)  # token ids are no numbers to normalise
+        if not self._observations_are_chosen:
+            self._leave_out_other_observations()
         for key, feature in self.image_features.items():
             if not self.observes_camera(key, feature):
                 what = "images" if not self.takes_images else "images but of three colours, named observation.*"
@@ -313,6 +316,19 @@ class HDPConfig(PreTrainedConfig):
             self.observation_token_sizes = self._token_sizes(features)
         if self.symbol_process is not None:
             self._set_symbols(features)
+        velocities = [name for name in features[ACTION].get("names") or [] if str(name).endswith(".vel")]
+        if velocities and self.plans_whole_episodes:
+            logging.warning(
+                "The actions %s are velocities. When a plan has ended, its last action is held: end episodes at rest, "
+                "and runs with the plan.", ", ".join(velocities),
+            )  # fmt: skip
+
+    def _leave_out_other_observations(self) -> None:
+        """Of what is neither a state, nor poses, nor an image, LeRobot's robots and environments hand over nothing."""
+        others = [key for key in self.input_features if key not in (OBS_STATE, OBS_ENV_STATE, *self.image_features)]
+        for key in others:
+            logging.warning("%s is left out: to observe it, name it in --policy.input_features", key)
+            del self.input_features[key]
 
     def observes_camera(self, key: str, feature: PolicyFeature) -> bool:
         """Whether the planner takes a camera of a dataset, by its name and its shape (channels, height, width)."""
@@ -322,14 +338,14 @@ class HDPConfig(PreTrainedConfig):
     def _token_sizes(self, features: dict[str, dict]) -> list[int]:
         """Sizes of the condition tokens, see `object_tokens`."""
         lengths = {key: math.prod(feature.shape) for key, feature in self.input_features.items()}
-        lengths |= dict.fromkeys(self.image_features, image_feature_size(self.spatial_softmax_num_keypoints))
+        lengths |= dict.fromkeys(self.image_features, 2 * self.spatial_softmax_num_keypoints)
         if not self.object_tokens:
             return [sum(lengths.values())]
         sizes = []
         for key, length in lengths.items():
             names = features.get(key, {}).get("names")
             names_components = key == OBS_ENV_STATE and isinstance(names, list) and len(names) == length
-            sizes += object_sizes(names) if names_components else [length]
+            sizes += _object_sizes(names) if names_components else [length]
         return sizes
 
     def _set_symbols(self, features: dict[str, dict]) -> None:
@@ -426,6 +442,16 @@ def _check_chosen(chosen: dict[str, PolicyFeature], known: dict[str, PolicyFeatu
         said, found = ((value.type.value, *value.shape) for value in (feature, known[key]))
         if said != found:
             raise ValueError(f"input_features says that {key} is {said}, in the dataset it is {found}")
+
+
+def _object_sizes(names: Iterable[str]) -> list[int]:
+    """How many consecutive components belong to each object; they are named `object.component`.
+
+    Example:
+        >>> _object_sizes(["red.x", "red.y", "blue.x", "blue.y"])
+        [2, 2]
+    """
+    return [len(list(group)) for _, group in groupby(names, key=lambda name: name.rpartition(".")[0])]
 
 
 def _check_choice(name: str, value: Any, choices: Sequence[str]) -> None:

@@ -1,7 +1,6 @@
 """Observation -> condition tokens."""
 
 from collections.abc import Iterable, Mapping
-from itertools import groupby
 from typing import Any
 
 import torch
@@ -95,20 +94,5 @@ class ImageEncoder(nn.Module):
         return self
 
     def forward(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Normalised images (B, 3, height, width) of each camera -> (B, `image_feature_size`) of each."""
+        """Normalised images (B, 3, height, width) of each camera -> features (B, 2 * keypoints) of each."""
         return {camera: encode(batch[camera]) for camera, encode in zip(self.cameras, self.encoders, strict=True)}
-
-
-def image_feature_size(num_keypoints: int) -> int:
-    """Numbers that an image becomes: two coordinates of each keypoint, through a linear layer and a ReLU."""
-    return 2 * num_keypoints
-
-
-def object_sizes(names: Iterable[str]) -> list[int]:
-    """How many consecutive components belong to each object; they are named `object.component`.
-
-    Example:
-        >>> object_sizes(["red.x", "red.y", "blue.x", "blue.y"])
-        [2, 2]
-    """
-    return [len(list(group)) for _, group in groupby(names, key=lambda name: name.rpartition(".")[0])]

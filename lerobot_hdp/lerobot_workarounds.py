@@ -2,8 +2,6 @@
 
 import logging
 
-from lerobot.datasets.sampler import EpisodeAwareSampler
-
 
 def keep_data_order_on_resume() -> None:
     """Let a resumed run go on in the epoch where it stopped.
@@ -12,8 +10,11 @@ def keep_data_order_on_resume() -> None:
     sampler so: after the first epoch, a resumed run sees other data than an uninterrupted one. If what the loader says
     first is 0, the restored epoch is added to all that it says from then on.
 
-    To be removed with LeRobot pull request 4692, after which the loader says the right epoch.
+    In a run on several processes, batches are the same only where batch size times processes divides the number of
+    samples. To be removed with LeRobot pull request 4692, after which the loader says the right epoch.
     """
+    from lerobot.datasets.sampler import EpisodeAwareSampler  # not where the plugin is only discovered
+
     set_epoch, load_state_dict = EpisodeAwareSampler.set_epoch, EpisodeAwareSampler.load_state_dict
     if getattr(set_epoch, "keeps_data_order", False):
         return

@@ -11,9 +11,11 @@ from typing import Any, NoReturn
 import numpy as np
 import torch
 from huggingface_hub import ModelCard
+from lerobot.configs import NormalizationMode
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.utils import get_dtype_from_parameters
 from lerobot.utils.constants import ACTION
 from safetensors import SafetensorError
 from torch import Generator, Tensor, nn
@@ -22,6 +24,7 @@ from .candidates import PARTIAL_MOTION_CANDIDATES, best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from .denoiser import Denoiser, Prediction
 from .encoders import ImageEncoder, StateEncoder
+from .lerobot_workarounds import keep_data_order_on_resume
 from .model_card import describe_planner
 from .moving_average import MovingAverage
 from .optimizer import parameter_groups
@@ -106,8 +109,8 @@ class HDPPolicy(PreTrainedPolicy):
 
     Args:
         config: the planner's configuration, complete with what the dataset says.
-        dataset_stats: of the dataset that the policy is to be trained on; see `widen_narrow_ranges`. LeRobot makes the
-            normaliser of the same ones afterwards, in fine-tuning too.
+        dataset_stats: of the dataset that the policy is to be trained on. LeRobot normalises by the same ones; where a
+            checkpoint is trained on, without another look at them, so that `widen_narrow_ranges` changes them here.
         dataset_meta: metadata of the dataset that the policy is to be trained on; its episodes are checked against
             the horizon. With it, a new policy's image encoders start from `pretrained_backbone_weights`; a checkpoint
             has weights of its own.
@@ -122,9 +125,14 @@ class HDPPolicy(PreTrainedPolicy):
     def __init__(self, config: HDPConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any):
         super().__init__(config)
         config.validate_features()
-        widen_narrow_ranges(config, dataset_stats or {})
+        if dataset_stats is not None:
+            _check_statistics(config, dataset_stats)
+            if config.pretrained_path is not None:
+                widen_narrow_ranges(config, dataset_stats)
         if config.num_candidates > 1:
             self._check_can_score()
+        if dataset_meta is not None:
+            keep_data_order_on_resume()
         if dataset_meta is not None and config.plans_whole_episodes:
             _check_episodes_fit(config, dataset_meta.episodes["length"])
         self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
@@ -359,8 +367,8 @@ class HDPPolicy(PreTrainedPolicy):
         """What is given of each plan of a batch.
 
         It comes from the argument, else from the configuration (`--policy.prompt`), else from the environment, in
-        `observation.symbolic_plan`. In a batch of a dataset that column is the recorded plan: give "" to plan freely
-        from one. Where words do not say their place in the plan ("... STACK red"), the planner
+        `observation.symbolic_plan`. In a batch of a dataset that column holds the recorded plans, in which nothing is
+        left open; they are no prompt. Where words do not say their place in the plan ("... STACK red"), the planner
         draws one, by one call of the network.
 
         Args:
@@ -375,7 +383,7 @@ class HDPPolicy(PreTrainedPolicy):
             self._check_observations(batch)
         if prompt is None and self.config.prompt:
             prompt = self.config.prompt
-        if prompt is None and OBS_SYMBOLIC_PLAN in batch and self.symbol_process is not None:
+        if prompt is None and self.symbol_process is not None and _is_prompt(batch.get(OBS_SYMBOLIC_PLAN)):
             prompt = PlanPrompt(token_ids=batch[OBS_SYMBOLIC_PLAN])
         if prompt is None:
             return PlanPrompt()
@@ -450,10 +458,13 @@ class HDPPolicy(PreTrainedPolicy):
         """The denoiser for the observations of a batch."""
         network = self._planning_network
         observation = batch[CONDITION] if CONDITION in batch else network.encode(batch)
+        dtype = get_dtype_from_parameters(network)
 
         def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
+            if symbols is not None and symbols.is_floating_point():
+                symbols = symbols.to(dtype)
             with self._autocast():
-                prediction = network.denoiser(motion, symbols, observation, k_c, k_d)
+                prediction = network.denoiser(motion.to(dtype), symbols, observation, k_c.to(dtype), k_d.to(dtype))
             return Prediction(*(None if part is None else part.float() for part in prediction))
 
         return denoise
@@ -602,6 +613,23 @@ def _rank_and_world_size() -> tuple[int, int]:
     if not torch.distributed.is_initialized():
         return 0, 1
     return torch.distributed.get_rank(), torch.distributed.get_world_size()
+
+
+def _is_prompt(token_ids: Tensor | None) -> bool:
+    """Whether a column of plans leaves anything open; else it is what a dataset has recorded."""
+    return token_ids is not None and bool((token_ids < PAD_ID).any())
+
+
+def _check_statistics(config: HDPConfig, stats: dict[str, Any]) -> None:
+    """Whether all that is normalised can be: LeRobot would leave the rest as it is, without a word."""
+    for key, feature in {**config.input_features, **config.output_features}.items():
+        mode = config.normalization_mapping.get(feature.type.value, NormalizationMode.IDENTITY)
+        if mode is not NormalizationMode.IDENTITY and key not in stats:
+            raise ValueError(
+                f"there are no statistics of {key}, to normalise it by. Where --rename_map renames it, train with "
+                "hdp-train; where it was added to the dataset, first run lerobot-edit-dataset "
+                "--operation.type=recompute_stats"
+            )
 
 
 def _check_episodes_fit(config: HDPConfig, lengths: Sequence[int]) -> None:

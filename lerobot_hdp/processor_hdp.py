@@ -21,6 +21,8 @@ from .vocabulary import FREE, FREE_SYMBOL, PAD_ID
 
 NARROWEST_RANGE = 0.1
 """What `widen_narrow_ranges` leaves of the widest range."""
+RANGE_OF_CONSTANT = 1.0
+"""What it takes for half of the range of an observation that never varies."""
 
 
 @ProcessorStepRegistry.register(name="hdp_observation_shapes")
@@ -112,7 +114,8 @@ def make_hdp_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
     """LeRobot's default processors, after a look at the observations, and the symbolic plan as token ids."""
-    widen_narrow_ranges(config, dataset_stats or {})
+    dataset_stats = {key: dict(bounds) for key, bounds in (dataset_stats or {}).items()}
+    widen_narrow_ranges(config, dataset_stats)
     steps = make_default_policy_processor_steps(config, dataset_stats)
     shapes = {key: list(feature.shape) for key, feature in config.input_features.items()}
     if config.resize_shape is not None:
@@ -140,7 +143,7 @@ def widen_narrow_ranges(config: HDPConfig, stats: dict[str, dict[str, Any]]) -> 
     Where plans begin, some components never vary, as the orientation of blocks that stand upright. Over all frames they
     have a tiny range, that of contacts; scaled by it to [-1, 1], a turn by a tenth of a degree would be far beyond all
     that the planner has seen. It takes the components of an observation to be in comparable units: metres and radians,
-    but not metres and degrees.
+    but not metres and degrees. An observation of which nothing varies gets a range of one unit to each side.
 
     Args:
         config: says what is observed, and which of it is normalised by its range.
@@ -151,11 +154,13 @@ def widen_narrow_ranges(config: HDPConfig, stats: dict[str, dict[str, Any]]) -> 
             continue
         low, high = (np.asarray(stats[key][bound]) for bound in ("min", "max"))
         middle, half = (low + high) / 2, (high - low) / 2
-        narrowest = NARROWEST_RANGE * half.max()
+        narrowest = NARROWEST_RANGE * half.max() or RANGE_OF_CONSTANT
         narrow = half < narrowest
         stats[key]["min"] = np.where(narrow, middle - narrowest, low)
         stats[key]["max"] = np.where(narrow, middle + narrowest, high)
-        if (half < 0.99 * narrowest).any():  # not widened before
+        if half.max() == 0:
+            logging.warning("%s is the same in all frames", key)
+        elif (half < 0.99 * narrowest).any():  # not widened before
             logging.info(
                 "%s: components %s vary by less than a tenth of the widest one's range, %.3g, and are normalised by a "
                 "tenth of it. If they are in other units than it, put them into an observation of their own.",

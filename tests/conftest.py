@@ -1,6 +1,7 @@
 """What several test files share: a recorded dataset, and a policy made for it."""
 
 import contextlib
+import inspect
 import io
 import logging
 import os
@@ -28,6 +29,7 @@ import lerobot_policy_hdp  # noqa: F401 (registers the policy and the environmen
 from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import sort_blocks_2d
 from lerobot_hdp import HDPConfig
+from lerobot_hdp.denoiser import Denoiser
 from lerobot_hdp.modeling_hdp import HDPPolicy
 
 torch.set_num_threads(1)  # as in the commands that tests run: weights are compared
@@ -147,6 +149,19 @@ def inputs(make_planner, batch):
     return observation(preprocessor(batch))
 
 
+def calls_of_network(policy: HDPPolicy) -> list[dict[str, torch.Tensor]]:
+    """The arguments, by name, of each call of the policy's denoisers from now on."""
+    calls, signature = [], inspect.signature(Denoiser.forward)
+
+    def note(denoiser, args, kwargs):
+        calls.append(signature.bind(denoiser, *args, **kwargs).arguments)
+
+    for module in policy.modules():
+        if isinstance(module, Denoiser):
+            module.register_forward_pre_hook(note, with_kwargs=True)
+    return calls
+
+
 def train_in_process(policy, inputs, steps: int) -> list[dict[str, float]]:
     """Optimise on one preprocessed batch; the parts of the loss at each step."""
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
@@ -159,6 +174,11 @@ def train_in_process(policy, inputs, steps: int) -> list[dict[str, float]]:
         optimizer.zero_grad()
         history.append(parts)
     return history
+
+
+@pytest.fixture(autouse=True)
+def fixed_seed():
+    torch.manual_seed(0)
 
 
 class Demonstrations(NamedTuple):

@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 import torch
 from draccus.utils import ParsingError
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 from torch.utils.data import default_collate
 
@@ -18,7 +18,7 @@ from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.processor_hdp import SymbolicPlanProcessorStep
 from lerobot_hdp.prompt import encode_prompt
 
-from .conftest import HORIZON, TINY_PLANNER, observation, train_in_process
+from .conftest import HORIZON, TINY_PLANNER, calls_of_network, observation, train_in_process
 
 
 def test_sizes_and_vocabulary_come_from_the_dataset(make_planner):
@@ -84,20 +84,19 @@ def test_what_hardly_varies_in_the_dataset_is_not_blown_up(dataset, make_planner
     key = "observation.environment_state"
     raw = dataset.meta.stats[key]
 
-    def with_a_narrow_component() -> None:
-        narrow = raw["max"].copy()
-        narrow[0] = raw["min"][0] + 1e-6
-        monkeypatch.setitem(dataset.meta.stats, key, {**raw, "max": narrow})
-
-    with_a_narrow_component()
-    _, new, postprocessor = make_planner()
+    narrow = raw["max"].copy()
+    narrow[0] = raw["min"][0] + 1e-6
+    monkeypatch.setitem(dataset.meta.stats, key, {**raw, "max": narrow})
+    policy, new, postprocessor = make_planner()
     assert caplog.text.count(f"{key}: components [0] vary by less than a tenth of the widest one's range") == 1
-    for processor in (new, postprocessor):
-        processor.save_pretrained(tmp_path)
-    with_a_narrow_component()
-    policy, *_ = make_planner()
+    assert dataset.meta.stats[key]["max"] is narrow  # for whatever else is trained on it
+    for part in (policy, new, postprocessor):
+        part.save_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config.pretrained_path = tmp_path
+    make_policy(config, ds_meta=dataset.meta)
     resumed, _ = make_pre_post_processors(
-        policy.config, str(tmp_path), preprocessor_overrides={"normalizer_processor": {"stats": dataset.meta.stats}}
+        config, str(tmp_path), preprocessor_overrides={"normalizer_processor": {"stats": dataset.meta.stats}}
     )
     moved = {**batch, key: batch[key].clone()}
     moved[key][:, :2] += 1e-3
@@ -106,6 +105,21 @@ def test_what_hardly_varies_in_the_dataset_is_not_blown_up(dataset, make_planner
         wide, widest = (raw["max"] - raw["min"])[1], (raw["max"] - raw["min"])[1:].max()
         torch.testing.assert_close(change[:, 1], torch.full((4,), 2e-3 / wide), rtol=1e-3, atol=1e-5)
         torch.testing.assert_close(change[:, 0], torch.full((4,), 2e-3 / (0.1 * widest)), rtol=1e-3, atol=1e-5)
+
+
+def test_an_observation_that_never_varies_is_not_blown_up(dataset, make_planner, batch, monkeypatch):
+    key = "observation.state"
+    constant = batch[key][0].numpy()
+    monkeypatch.setitem(dataset.meta.stats, key, {**dataset.meta.stats[key], "min": constant, "max": constant})
+    _, preprocessor, _ = make_planner()
+    moved = {**batch, key: batch[key][:1].expand(4, -1) + 1e-3}
+    torch.testing.assert_close(preprocessor(moved)[key], torch.full_like(batch[key], 1e-3), rtol=1e-3, atol=1e-6)
+
+
+def test_what_cannot_be_normalised_is_refused(dataset, make_planner, monkeypatch):
+    monkeypatch.delitem(dataset.meta.stats, "observation.state")
+    with pytest.raises(ValueError, match=r"no statistics of observation.state.*recompute_stats"):
+        make_planner()
 
 
 def test_tokens_survive_from_the_dataset_to_the_model_and_back_to_words(make_planner, batch, dataset):
@@ -131,13 +145,11 @@ def test_loss_is_the_weighted_sum_of_its_logged_parts(make_planner, batch):
 @pytest.mark.parametrize("planner", ["hdp", "separate_diffuser"])
 def test_training_shows_symbols_that_lead_as_often_as_it_is_told(make_planner, batch, planner, lead_share):
     policy, preprocessor, _ = make_planner(planner, lead_share=lead_share)
-    seen = []
-    policy.planner.denoiser.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[-2:]))
+    calls = calls_of_network(policy)
     for _ in range(5):
         policy.train().forward(preprocessor(batch))
-    motion_levels, symbol_levels = (torch.stack(levels) for levels in zip(*seen, strict=True))
-    assert (motion_levels == 1).all() == bool(lead_share)
-    assert symbol_levels.min() < 0.5
+    assert all((call["motion_level"] == 1).all() for call in calls) == bool(lead_share)
+    assert min(call["symbol_level"].min() for call in calls) < 0.5
 
 
 def test_each_token_of_a_plan_has_a_probability(make_planner, batch):
@@ -151,9 +163,8 @@ def test_each_token_of_a_plan_has_a_probability(make_planner, batch):
 @pytest.mark.parametrize("num_inference_steps", [1, 4, 10])
 def test_the_number_of_network_calls_is_the_users_choice(make_planner, batch, sampler, num_inference_steps):
     policy, preprocessor, _ = make_planner(sampler=sampler, num_inference_steps=num_inference_steps)
-    calls = []
-    policy.eval()._planning_network.denoiser.register_forward_hook(lambda *_: calls.append(1))
-    policy.plan(observation(preprocessor(batch)))
+    calls = calls_of_network(policy)
+    policy.eval().plan(observation(preprocessor(batch)))
     assert len(calls) == num_inference_steps
 
 
@@ -168,14 +179,12 @@ def motion_moves(policy, inputs, prompt=None):
 @pytest.mark.parametrize("planner", ["hdp", "separate_diffuser"])
 def test_symbols_lead_a_motion_that_is_pure_noise(make_planner, batch, planner, sampler):
     policy, preprocessor, _ = make_planner(planner, sampler=sampler, num_inference_steps=10, symbol_lead=0.3)
-    inputs, levels = observation(preprocessor(batch)), []
-    policy._planning_network.denoiser.register_forward_pre_hook(
-        lambda _, arguments: levels.append((arguments[3].max().item(), arguments[4].min().item()))
-    )
-    assert motion_moves(policy, inputs) == [False] * 3 + [True] * 7
-    assert [k_c for k_c, _ in levels[:4]] == [1.0] * 4
-    assert levels[4][0] < 1
-    assert levels[3][1] < levels[0][1] == 1  # symbols have been denoised meanwhile
+    calls = calls_of_network(policy)
+    assert motion_moves(policy, observation(preprocessor(batch))) == [False] * 3 + [True] * 7
+    assert [call["motion_level"].max() for call in calls[:4]] == [1] * 4
+    assert calls[4]["motion_level"].max() < 1
+    k_d = [call["symbol_level"].min() for call in calls]
+    assert k_d[3] < k_d[0] == 1  # symbols have been denoised meanwhile
 
 
 def test_symbols_that_have_something_to_follow_do_not_lead(make_planner, batch):
@@ -214,27 +223,21 @@ def test_given_symbols_stay_fixed_in_every_step(make_planner, batch):
 
 def test_with_all_symbols_given_the_denoiser_is_told_that_they_are_clean(make_planner, batch):
     policy, preprocessor, _ = make_planner()
-    inputs, levels = preprocessor(batch), []
-    policy.eval()._planning_network.denoiser.register_forward_pre_hook(
-        lambda _, arguments: levels.append((arguments[3].max().item(), arguments[4].max().item()))
-    )
+    inputs, calls = preprocessor(batch), calls_of_network(policy)
     tokens = inputs["observation.symbolic_plan"]
-    plan = policy.plan(observation(inputs), PlanPrompt(token_ids=tokens))
+    plan = policy.eval().plan(observation(inputs), PlanPrompt(token_ids=tokens))
     assert torch.equal(plan.token_ids, tokens)
-    assert {k_d for _, k_d in levels} == {0.0}
-    assert levels[0][0] == 1.0
+    assert all((call["symbol_level"] == 0).all() for call in calls)
+    assert calls[0]["motion_level"].max() == 1
 
 
 def test_with_the_motion_given_only_symbols_are_sampled(make_planner, batch):
     policy, preprocessor, _ = make_planner()
-    inputs, levels = preprocessor(batch), []
-    policy.eval()._planning_network.denoiser.register_forward_pre_hook(
-        lambda _, arguments: levels.append((arguments[3].max().item(), arguments[4].max().item()))
-    )
-    plan = policy.plan(observation(inputs), PlanPrompt(actions=inputs["action"]))
+    inputs, calls = preprocessor(batch), calls_of_network(policy)
+    plan = policy.eval().plan(observation(inputs), PlanPrompt(actions=inputs["action"]))
     assert torch.equal(plan.actions, inputs["action"])
-    assert {k_c for k_c, _ in levels} == {0.0}
-    assert levels[0][1] == 1.0
+    assert all((call["motion_level"] == 0).all() for call in calls)
+    assert calls[0]["symbol_level"].max() == 1
     assert plan.token_ids.max() < len(policy.vocabulary)
 
 
@@ -252,8 +255,7 @@ def test_a_smaller_n_action_steps_replans(make_planner, batch):
     policy, preprocessor, _ = make_planner(n_action_steps=5, plan_from="any_frame")
     inputs = observation(preprocessor(batch))
     assert policy.eval().predict_action_chunk(inputs).shape == (4, 5, 3)
-    calls = []
-    policy._planning_network.denoiser.register_forward_hook(lambda *_: calls.append(1))
+    calls = calls_of_network(policy)
     for _ in range(11):
         policy.select_action(inputs)
     assert len(calls) == 3 * policy.config.num_train_timesteps
@@ -317,8 +319,9 @@ def test_an_open_prompt_stays_open_where_it_is_filled(make_planner, batch):
     assert not policy.read_prompt(inputs).not_pad[:, 1:].any()
 
 
-def test_planning_uses_the_moving_average_of_the_weights(make_planner, batch):
-    policy, preprocessor, _ = make_planner()
+@pytest.mark.parametrize("ema_max_decay", [0.9999, 0.5])
+def test_planning_uses_the_moving_average_of_the_weights(make_planner, batch, ema_max_decay):
+    policy, preprocessor, _ = make_planner(ema_max_decay=ema_max_decay)
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     inputs = preprocessor(batch)
     name, weight = next(iter(policy.planner.named_parameters()))
@@ -327,10 +330,17 @@ def test_planning_uses_the_moving_average_of_the_weights(make_planner, batch):
         policy.train().forward(inputs)[0].backward()
         optimizer.step()
         policy.update()
-        decay = 0.0 if update == 0 else min(1 - (1 + update) ** -0.75, 0.9999)
+        decay = 0.0 if update == 0 else min(1 - (1 + update) ** -0.75, ema_max_decay)
         expected = decay * expected + (1 - decay) * weight.detach()
     torch.testing.assert_close(dict(policy.ema.module.named_parameters())[name].detach(), expected)
-    assert policy._planning_network is policy.ema.module
+    plans = []
+    for changed in (None, policy.planner, policy.ema.module):
+        if changed is not None:
+            torch.nn.init.ones_(changed.get_parameter(name))
+        plan = policy.eval().plan(observation(inputs), generator=torch.Generator().manual_seed(0))
+        plans.append(plan.actions)
+    assert torch.equal(plans[1], plans[0])
+    assert not torch.equal(plans[2], plans[0])
 
 
 def test_a_planner_saved_without_averaged_weights_can_be_trained_on_with_some(make_planner, tmp_path):
@@ -452,11 +462,10 @@ class TestPaperPreset:
     def test_has_the_papers_values(self):
         config = HDPConfig(preset="paper", horizon=145, device="cpu")
         assert (config.num_layers, config.num_heads, config.width, config.dropout) == (8, 4, 256, 0.3)
-        assert (config.prediction_type, config.num_train_timesteps, config.symbol_loss_weight) == (
-            "epsilon",
-            100,
-            1 / 30,
-        )
+        assert (config.rotary, config.object_tokens, config.observation_weight_std) == (False, False, 0.02)
+        assert (config.prediction_type, config.num_train_timesteps) == ("epsilon", 100)
+        assert (config.symbol_loss_weight, config.optimizer_type) == (1 / 30, "adamw")
+        assert (config.sampler, config.symbol_lead, config.num_inference_steps) == ("ddpm", 0, 100)
         optimizer, scheduler = config.get_optimizer_preset(), config.get_scheduler_preset()
         assert (optimizer.lr, optimizer.betas, optimizer.weight_decay) == (1e-4, (0.9, 0.95), 1e-3)
         assert scheduler.num_warmup_steps == 1000
@@ -473,12 +482,6 @@ class TestPaperPreset:
 
 
 class TestBadInput:
-    def test_a_prompt_of_the_wrong_length(self, make_planner, batch):
-        policy, preprocessor, _ = make_planner()
-        prompt = PlanPrompt(token_ids=torch.zeros(4, 20, dtype=torch.int64))
-        with pytest.raises(ValueError, match=r"shape \(4, 18\) and the type torch.int64, got \(4, 20\)"):
-            policy.eval().plan(observation(preprocessor(batch)), prompt)
-
     def test_a_token_id_without_a_symbol(self, make_planner, batch):
         _, preprocessor, _ = make_planner()
         batch["observation.symbolic_plan"][0, 0] = 8
@@ -586,6 +589,7 @@ class TestBadInput:
             {"n_obs_steps": 2},
             {"width": 30, "num_heads": 4},
             {"width": 2, "num_heads": 1},
+            {"rotary": True, "width": 6, "num_heads": 2},
             {"horizon": 0},
             {"horizon": 10, "n_action_steps": 11},
             {"n_action_steps": 5, "horizon": 10},  # with plan_from=episode_start
@@ -595,6 +599,9 @@ class TestBadInput:
             {"confidence_threshold": -1.0},
             {"symbol_lead": 1.0},
             {"symbol_lead": -0.1},
+            {"lead_share": 1.5},
+            {"mask_schedule": "sine"},
+            {"optimizer_type": "sgd"},
             {"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}},
             {"num_inference_steps": 101},
             {"num_candidates": 0},

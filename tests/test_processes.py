@@ -1,4 +1,4 @@
-"""The two diffusion processes against the paper's equations."""
+"""The diffusion processes against the paper's equations."""
 
 import math
 from itertools import pairwise
@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from lerobot_hdp.processes import Corrupted, GaussianProcess, MaskedProcess
+from lerobot_hdp.processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess
 
 N = 100
 
@@ -64,6 +64,14 @@ class TestGaussianProcess:
             sample = process.predicted_sample(corrupted.value[row], corrupted.target[row], level[i])
             torch.testing.assert_close(sample, clean[row], atol=1e-4, rtol=0)
 
+    @pytest.mark.parametrize("prediction_type", ["epsilon", "sample", "v_prediction"])
+    def test_what_is_predicted_outside_of_the_normalised_range_is_clipped(self, prediction_type):
+        process, level = GaussianProcess(N, prediction_type), torch.tensor(0.5)
+        far = torch.tensor([3.0, -3.0, 0.5]).expand(2, 4, 3)
+        corrupted = process.corrupt(far, level.expand(2), generator())
+        sample = process.predicted_sample(corrupted.value, corrupted.target, level)
+        torch.testing.assert_close(sample, far.clamp(-1, 1), atol=1e-4, rtol=0)
+
     def test_ddim_is_deterministic_and_ddpm_is_not(self):
         value, prediction = torch.randn(2, 4, 3, generator=generator()), torch.zeros(2, 4, 3)
         levels = torch.tensor(0.8), torch.tensor(0.4)
@@ -94,6 +102,14 @@ class TestGaussianProcess:
         assert counts[0] == 0
         assert counts[1:].min() > 850
         assert counts[1:].max() < 1150
+
+
+class TestGaussianSymbolProcess:
+    def test_a_clean_token_is_a_vector_with_one_at_its_id_and_minus_one_elsewhere(self):
+        process, tokens = GaussianSymbolProcess(3, N, "sample"), torch.tensor([[0, 2]])
+        value = process.corrupt(tokens, torch.zeros(1), generator()).value
+        assert value.tolist() == [[[1, -1, -1], [-1, -1, 1]]]
+        assert torch.equal(process.tokens(value), tokens)
 
 
 class TestMaskedProcess:

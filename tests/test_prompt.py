@@ -224,6 +224,22 @@ class TestThroughThePolicy:
         assert [plan.symbols(i)[:2] for i in range(4)] == [["PICK", "B"]] * 4
         assert policy.plan(inputs, "PICK A").symbols()[:2] == ["PICK", "A"]
 
+    def test_a_recorded_plan_is_no_prompt_and_one_with_an_open_place_is(self, make_planner, batch):
+        policy, preprocessor, _ = make_planner()
+        inputs = preprocessor(batch)
+        assert policy.read_prompt(inputs).token_ids is None
+        inputs["observation.symbolic_plan"][0, -1] = FREE
+        given = policy.read_prompt(inputs)
+        assert torch.equal(given.token_ids, inputs["observation.symbolic_plan"])
+        assert given.tokens_mask.sum() == given.token_ids.numel() - 1
+
+    def test_an_empty_prompt_gives_nothing_whatever_the_others_say(self, make_planner, batch):
+        policy, preprocessor, _ = make_planner(prompt="PICK B")
+        inputs = preprocessor(batch)
+        inputs["observation.symbolic_plan"][0, -1] = FREE
+        assert policy.read_prompt(inputs).tokens_mask.sum() == 2 * 4
+        assert not policy.read_prompt(inputs, "").tokens_mask.any()
+
     def test_a_wrong_prompt_in_the_configuration_is_refused_when_a_checkpoint_is_loaded(self, make_planner, tmp_path):
         policy, *_ = make_planner()
         policy.save_pretrained(tmp_path)
@@ -237,8 +253,3 @@ class TestThroughThePolicy:
         plan = policy.plan(inputs, PlanPrompt(token_ids=token_ids, actions=actions))
         assert torch.equal(plan.actions, actions)
         assert plan.symbols()[:2] == ["PICK", "B"]
-
-    def test_a_planner_without_symbols_takes_no_words(self, make_planner, inputs):
-        policy, *_ = make_planner("diffuser")
-        with pytest.raises(ValueError, match="takes no symbolic prompt"):
-            policy.eval().plan(inputs, "PICK A")

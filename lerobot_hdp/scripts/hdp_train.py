@@ -35,6 +35,7 @@ from torch.utils.data import Dataset, Subset
 
 from lerobot_hdp.configuration_hdp import HDPConfig
 from lerobot_hdp.in_memory_dataset import Batch, InMemoryDataset, memory_needed, unsupported
+from lerobot_hdp.lerobot_workarounds import keep_data_order_on_resume
 
 GIB = 2**30
 
@@ -248,6 +249,7 @@ def main() -> None:
     if "--help" in sys.argv or "-h" in sys.argv:
         parser.print_help()
     lerobot_train.submit_to_hf = refuse_to_submit
+    keep_data_order_on_resume()
     normalise_renamed_observations()
     hold_datasets_in_memory(options.max_memory_gib)
     start_where_plans_begin()
