@@ -258,7 +258,8 @@ def run_cells(cells: list[Cell], processes: int = 1, budget_minutes: float | Non
     missing = [cell for cell in cells if not cell.result_file.exists()]
     if finished := len(cells) - len(missing):
         folders = " and ".join(sorted({str(cell.result_file.parent) for cell in cells}))
-        print(f"{finished} of {len(cells)} are finished; to run one again, delete its file in {folders}", flush=True)
+        how = f"delete its file in {folders}, and its folder in {WORK}"
+        print(f"{finished} of {len(cells)} are finished; to run one again, {how}", flush=True)
     for cell in missing:
         if deadline.seconds_left > SHORTEST_TRAINING_S:
             record_dataset(cell, num_workers=os.cpu_count() or 1)

@@ -104,7 +104,7 @@ def write_page() -> None:
         f"| training, {result['num_workers']} workers for `lerobot-train`, samples/s | {rates['lerobot-train']:.0f} | "
         f"{rates['hdp-train']:.0f} | {ratio(quartiles(commands['ratio']))} |\n\n"
         f"A whole step of `hdp-train` takes {ratio(step['ratio'])} times as long as the bare forward pass, backward "
-        "pass and optimiser on a batch at hand, on one core. Less than 1 is what the measurement is wrong by.\n\n"
+        "pass and optimiser on a batch at hand, on one core. A ratio below 1 shows the measurement's error.\n\n"
         f"`{run['command']}`, code of {run['git_commit']}.\n\n{describe_steps()}"
     )
 

@@ -316,7 +316,7 @@ class HDPConfig(PreTrainedConfig):
             self.observation_token_sizes = self._token_sizes(features)
         if self.symbol_process is not None:
             self._set_symbols(features)
-        velocities = [name for name in features[ACTION].get("names") or [] if str(name).endswith(".vel")]
+        velocities = [name for name in features.get(ACTION, {}).get("names") or [] if str(name).endswith(".vel")]
         if velocities and self.plans_whole_episodes:
             logging.warning(
                 "The actions %s are velocities. When a plan has ended, its last action is held: end episodes at rest, "

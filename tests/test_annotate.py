@@ -7,16 +7,18 @@ from lerobot.datasets.dataset_tools import remove_feature
 from dataset_tools.annotate import add_symbolic_plans
 from dataset_tools.demonstration import PlanStep
 from lerobot_hdp import HDPConfig
+from lerobot_hdp.scripts import hdp_train
 
-from .conftest import HORIZON, run_command
+from .conftest import HORIZON, call_command
 
 PICK, PLACE = PlanStep(("PICK", "CUP"), 8), PlanStep(("PLACE", "CUP", "TRAY"), 15)
 
 
-@pytest.fixture
-def without_plans(dataset_root, tmp_path) -> LeRobotDataset:
+@pytest.fixture(scope="module")
+def without_plans(dataset_root, tmp_path_factory) -> LeRobotDataset:
     dataset = LeRobotDataset("test/sorting", root=dataset_root, video_backend="pyav")
-    return remove_feature(dataset, "observation.symbolic_plan", output_dir=tmp_path / "without", repo_id="test/without")
+    root = tmp_path_factory.mktemp("datasets") / "without"
+    return remove_feature(dataset, "observation.symbolic_plan", output_dir=root, repo_id="test/without")
 
 
 def test_a_planner_trains_on_plans_that_were_written_afterwards(without_plans, tmp_path):
@@ -32,7 +34,7 @@ def test_a_planner_trains_on_plans_that_were_written_afterwards(without_plans, t
     flags = ["--dataset.repo_id=test/with", f"--dataset.root={tmp_path / 'with'}", "--dataset.video_backend=pyav"]
     flags += ["--policy.type=hdp", f"--policy.horizon={HORIZON}", "--policy.num_layers=1", "--policy.width=32"]
     flags += ["--policy.push_to_hub=false", "--batch_size=2", "--steps=1", "--env_eval_freq=0"]
-    run_command("hdp-train", *flags, f"--output_dir={tmp_path / 'run'}")
+    call_command(hdp_train.main, *flags, f"--output_dir={tmp_path / 'run'}")
     trained = HDPConfig.from_pretrained(tmp_path / "run/checkpoints/last/pretrained_model")
     assert (trained.vocabulary, trained.symbolic_horizon) == (vocabulary, 5)
 

@@ -1,13 +1,14 @@
 """The benchmarks can be started, say how, and have written the pages that are committed."""
 
 import importlib
+import json
 import pkgutil
 import shutil
 
 import pytest
 
 import benchmarks
-from benchmarks import task_pages
+from benchmarks import conditioning, planner_report, task_pages
 from benchmarks.paper.presets import METHODS, make_cells
 from benchmarks.planner_comparison import PRESETS, TASKS
 
@@ -45,13 +46,11 @@ def test_the_tasks_pages_are_what_the_committed_results_make(tmp_path, monkeypat
 
 
 def test_the_comparison_of_planners_is_what_the_committed_results_make(tmp_path, monkeypatch):
-    pytest.importorskip("matplotlib")
-    module = importlib.import_module("benchmarks.planner_report")
-    committed = module.PAGE
-    monkeypatch.setattr(module, "PAGE", tmp_path / "page.md")
-    monkeypatch.setattr(module, "plot_curves", lambda *_: None)
-    module.write_page(make_cells(PRESETS, TASKS, METHODS, [0, 1]))
-    assert module.PAGE.read_text() == committed.read_text()
+    committed = planner_report.PAGE
+    monkeypatch.setattr(planner_report, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(planner_report, "plot_curves", lambda *_: None)
+    planner_report.write_page(make_cells(PRESETS, TASKS, METHODS, [0, 1]))
+    assert planner_report.PAGE.read_text() == committed.read_text()
 
 
 @pytest.mark.parametrize(
@@ -73,3 +72,12 @@ def test_a_benchmark_runs(name, arguments, tmp_path, monkeypatch, capsys):
     [result] = tmp_path.rglob("*.json")
     assert "git_commit" in result.read_text()
     assert all(page.stat().st_size > 500 for page in tmp_path.glob("*.md"))
+
+
+def test_adherence_counts_the_plans_that_do_what_they_are_asked_for(tmp_path, monkeypatch):
+    arguments = ["--checkpoints", f"{SHIPPED}/xarm_tool_use", "--starts=2", f"--results={tmp_path}"]
+    monkeypatch.setattr("sys.argv", ["conditioning", "adherence", *arguments])
+    conditioning.main()
+    [result] = json.loads((tmp_path / "adherence_XArmToolUseRedOnTop.json").read_text())["results"]
+    assert result["with_prompt"]["adherence"]["rate"] == 1
+    assert result["without_prompt"]["adherence"]["rate"] < 1

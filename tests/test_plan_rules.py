@@ -67,6 +67,8 @@ def test_what_is_wrong_with_a_plan_that_arranges():
     assert f"move 3 places {plan[13]} in {plan[4]}, where {plan[3]} leaves no room for the open gripper" in found
     assert found[-1].startswith("no block ends in S")
     assert task.check_plan(plan[:10], observation) != []
+    another = [*plan[:3], plan[6], *plan[4:]]
+    assert f"move 1 picks {plan[1]}, but places {plan[6]}" in task.check_plan(another, observation)
 
 
 @pytest.mark.parametrize(

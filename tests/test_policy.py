@@ -122,6 +122,13 @@ def test_what_cannot_be_normalised_is_refused(dataset, make_planner, monkeypatch
         make_planner()
 
 
+@pytest.mark.parametrize(("plan_from", "is_warned"), [("episode_start", True), ("any_frame", False)])
+def test_velocities_that_would_be_held_are_warned_of(dataset, make_planner, monkeypatch, caplog, plan_from, is_warned):
+    monkeypatch.setitem(dataset.meta.features["action"], "names", ["x.vel", "y.vel", "gripper.pos"])
+    make_planner(plan_from=plan_from)
+    assert ("The actions x.vel, y.vel are velocities" in caplog.text) == is_warned
+
+
 def test_tokens_survive_from_the_dataset_to_the_model_and_back_to_words(make_planner, batch, dataset):
     policy, preprocessor, _ = make_planner()
     tokens = preprocessor(batch)["observation.symbolic_plan"]
@@ -222,7 +229,7 @@ def test_given_symbols_stay_fixed_in_every_step(make_planner, batch):
 
 
 def test_with_all_symbols_given_the_denoiser_is_told_that_they_are_clean(make_planner, batch):
-    policy, preprocessor, _ = make_planner()
+    policy, preprocessor, _ = make_planner(sampler="ddpm")
     inputs, calls = preprocessor(batch), calls_of_network(policy)
     tokens = inputs["observation.symbolic_plan"]
     plan = policy.eval().plan(observation(inputs), PlanPrompt(token_ids=tokens))

@@ -1,5 +1,6 @@
 """`hdp-record`: the data contract, interruptions, and what cannot be recorded."""
 
+import itertools
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ import numpy as np
 import psutil
 import pytest
 from draccus.utils import ParsingError
+from huggingface_hub import DatasetCard
 from lerobot.datasets.dataset_tools import delete_episodes
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -34,7 +36,7 @@ from dataset_tools.record import (
 from dataset_tools.replay import load_recording, replay
 from gym_hdp_tasks.env_config import HDPEnv
 
-from .conftest import HORIZON, N_EPISODES, TASK_FLAGS, run_command
+from .conftest import HORIZON, N_EPISODES, TASK_FLAGS, call_command, run_command
 
 
 def columns(root: Path) -> dict[str, np.ndarray]:
@@ -126,14 +128,15 @@ def test_a_recording_that_does_not_tell_its_number_of_episodes_replays(dataset, 
 def test_the_result_does_not_depend_on_the_number_of_processes(dataset_root, tmp_path):
     root = tmp_path / "two_workers"
     flags = ("--dataset.repo_id=test/sorting", f"--dataset.root={root}", f"--dataset.num_episodes={N_EPISODES}")
-    run_command("hdp-record", *TASK_FLAGS, *flags, "--num_workers=2")
+    run_command("hdp-record", "--env.type=hdp", *TASK_FLAGS, *flags, "--num_workers=2")
     assert_same_dataset(dataset_root, root)
 
 
 def test_a_cluster_engine_records_the_same_dataset(dataset_root, tmp_path):
     root = tmp_path / "cluster"
     flags = ("--dataset.repo_id=test/sorting", f"--dataset.root={root}", f"--dataset.num_episodes={N_EPISODES}")
-    run_command("python", "-m", "dataset_tools.record_on_cluster", *TASK_FLAGS, *flags, "--num_workers=2")
+    module = ("-m", "dataset_tools.record_on_cluster")
+    run_command("python", *module, "--env.type", "hdp", *TASK_FLAGS, *flags, "--num_workers=2")
     assert_same_dataset(dataset_root, root)
     assert not root.with_name("cluster.partial").exists()
 
@@ -155,19 +158,12 @@ def test_a_slurm_job_records_a_shard(tmp_path, monkeypatch):
     assert load_info(shard).total_episodes == 1
 
 
-@pytest.mark.parametrize(("module", "function"), [(recorder, "record"), (cluster, "record_on_cluster")])
-def test_env_type_may_be_given_as_to_lerobot_s_commands(monkeypatch, module, function):
-    configs: list[RecordConfig] = []
-    monkeypatch.setattr(module, function, configs.append)
+@pytest.mark.parametrize("module", [recorder, cluster])
+def test_environments_that_are_not_of_this_package_cannot_be_recorded(monkeypatch, module):
     monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    for env_type in ([], ["--env.type=hdp"], ["--env.type", "hdp"]):
-        monkeypatch.setattr(sys, "argv", ["record", "--dataset.repo_id=t/t", *env_type, *TASK_FLAGS])
-        module.main()
-    assert [config.env for config in configs] == [HDPEnv(n_blocks=2, waypoints_per_pose=1)] * 3
-    monkeypatch.setattr(sys, "argv", ["record", "--dataset.repo_id=t/t", "--env.type=aloha"])
     with pytest.raises(SystemExit, match=r"--env.type=aloha has no experts, only --env.type=hdp has$"):
-        module.main()
+        call_command(module.main, "--dataset.repo_id=t/t", "--env.type=aloha")
 
 
 def test_all_workers_have_work_in_a_short_recording_or_the_command_says_so(tmp_path, caplog):
@@ -252,17 +248,29 @@ def test_no_recorded_start_is_one_that_is_evaluated():
     assert not recorded & {first + number for first in firsts for number in range(most)}
 
 
-def test_the_command_goes_on_with_an_interrupted_recording_only_when_told_to(tmp_path):
+def test_the_command_goes_on_with_an_interrupted_recording_only_when_told_to(tmp_path, monkeypatch):
     config, flags = config_of(2, tmp_path / "stopped"), flags_of(2, tmp_path / "stopped")
     first_shard, _ = plan_shards(config)
     record_shard(config, first_shard)
-    refused = run_command("hdp-record", *flags, check=False)
-    assert refused.returncode == 1
-    assert refused.stderr.count("\n") == 1
-    assert "--resume=true" in refused.stderr
-    run_command("hdp-record", *flags, "--resume=true")
+    monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
+    with pytest.raises(SystemExit, match="--resume=true") as end:
+        call_command(recorder.main, *flags)
+    assert "\n" not in end.value.code
+    call_command(recorder.main, *flags, "--resume=true")
     assert load_info(config.root).total_episodes == 2
     assert not config.partial_root.exists()
+
+
+def test_an_interrupted_recording_goes_on_with_the_same_settings_only(tmp_path):
+    config = config_of(2, tmp_path / "stopped")
+    plan_shards(config)
+    for other in (
+        replace(config, seed=1),
+        replace(config, env=HDPEnv(n_blocks=3, waypoints_per_pose=1)),
+        replace(config, dataset=replace(config.dataset, num_episodes=3)),
+    ):
+        with pytest.raises(ValueError, match="has other settings than this command"):
+            record(replace(other, resume=True))
 
 
 def test_ctrl_c_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch):
@@ -301,10 +309,11 @@ def test_an_upload_without_a_login_is_refused_before_anything_is_recorded(to_upl
 
 
 def test_a_failed_upload_is_tried_again_on_what_was_recorded(to_upload, monkeypatch):
+    to_upload = replace(to_upload, dataset=replace(to_upload.dataset, private=True, tags=["mine"]))
     uploads = []
 
-    def upload(dataset, **_):
-        uploads.append(dataset.num_episodes)
+    def upload(dataset, tags, private, **_):
+        uploads.append((dataset.num_episodes, tags[-1], private))
         if len(uploads) == 1:
             raise RuntimeError("no network\n\ntry later")
 
@@ -315,7 +324,8 @@ def test_a_failed_upload_is_tried_again_on_what_was_recorded(to_upload, monkeypa
         record(to_upload)
     monkeypatch.setattr(recorder, "demonstrate", None)
     assert record(replace(to_upload, resume=True)).num_episodes == 2
-    assert uploads == [2, 2]
+    assert uploads == [(2, "mine", True)] * 2
+    assert "mine" in DatasetCard.load(to_upload.root / "README.md").data.tags
 
 
 def test_a_recording_that_was_killed_after_its_last_step_but_one_is_finished(to_upload):
@@ -344,11 +354,14 @@ def test_another_recording_is_not_taken_for_this_one(to_upload):
             record(other)
 
 
-def test_failed_demonstrations_are_dropped_and_counted(tmp_path, monkeypatch, capsys):
+def test_failed_demonstrations_are_dropped_and_counted_also_across_an_interruption(tmp_path, monkeypatch, capsys):
     """An expert that now and then forgets to open the gripper at the end."""
-    expert = EXPERTS["hdp/BlockSorting2D-v0"]
+    expert, calls = EXPERTS["hdp/BlockSorting2D-v0"], itertools.count()
+    monkeypatch.setattr(recorder, "FEWEST_SHARDS", 1)
 
     def careless(env, rng):
+        if next(calls) == 8:
+            raise KeyboardInterrupt
         demonstration = expert(env, rng)
         if rng.random() < 0.4:
             demonstration.waypoints[-1, 2] = 0.0
@@ -359,11 +372,15 @@ def test_failed_demonstrations_are_dropped_and_counted(tmp_path, monkeypatch, ca
         dataset=RecordDatasetConfig(repo_id="test/careless", root=tmp_path / "careless", num_episodes=10),
         env=HDPEnv(n_blocks=2, waypoints_per_pose=1),
     )
-    dataset = record(config)
+    with pytest.raises(KeyboardInterrupt):
+        record(config)
+    done_before = load_info(config.partial_root / "episodes_000000").total_episodes
+    dataset = record(replace(config, resume=True))
     failed = dataset.meta.features["observation.symbolic_plan"]["info"]["failed_attempts"]
     assert dataset.num_episodes == 10
     assert columns(tmp_path / "careless")["next.success"].reshape(10, HORIZON)[:, -1].all()
-    assert sum(failed.values()) > 0
+    assert min(map(int, failed)) < done_before <= max(map(int, failed))
+    assert replay(load_recording(dataset)) == [1.0] * 10
     assert f"dropped {sum(failed.values())} of {10 + sum(failed.values())}" in capsys.readouterr().out
 
 
@@ -419,10 +436,10 @@ def test_a_bad_flag_ends_the_command_with_an_error(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_dataset_is_not_overwritten(dataset_root):
+def test_an_existing_dataset_is_not_overwritten(dataset_root, monkeypatch):
     before = (dataset_root / "meta/info.json").read_bytes()
     flags = (*TASK_FLAGS, "--dataset.repo_id=test/sorting", f"--dataset.root={dataset_root}")
-    result = run_command("hdp-record", *flags, check=False)
-    assert result.returncode == 1
-    assert "exists already" in result.stderr
+    monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
+    with pytest.raises(SystemExit, match="exists already"):
+        call_command(recorder.main, *flags)
     assert (dataset_root / "meta/info.json").read_bytes() == before

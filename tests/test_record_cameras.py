@@ -10,6 +10,7 @@ from draccus.utils import ParsingError
 from lerobot.datasets.language_render import active_at
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.utils import env_to_policy_features
+from lerobot.scripts import lerobot_train
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from safetensors.torch import load_file
 
@@ -20,8 +21,9 @@ from dataset_tools.language import plans_of_subtasks, write_language_columns
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, episode_seed, record
 from dataset_tools.replay import load_recording, replay
 from gym_hdp_tasks.env_config import HDPEnv
+from lerobot_hdp.scripts import hdp_train
 
-from .conftest import DIFFUSION_FLAGS, run_command
+from .conftest import DIFFUSION_FLAGS, call_command
 
 SORTING = HDPEnv(task="XArmSorting-v0", obs_type="pixels_state", camera_height=40, camera_width=48)
 ARRANGE = HDPEnv(task="XArmArrangeBlocks-v0", obs_type="pixels_state", camera_height=40, camera_width=48)
@@ -182,13 +184,18 @@ PLANNER_FLAGS = ("--policy.type=hdp", "--policy.horizon=145", "--policy.num_laye
 
 
 @pytest.mark.parametrize(
-    "policy_flags",
-    [(*DIFFUSION_FLAGS, "--policy.horizon=16", "--policy.n_action_steps=8"), PLANNER_FLAGS],
+    ("script", "policy_flags"),
+    [
+        (lerobot_train, (*DIFFUSION_FLAGS, "--policy.horizon=16", "--policy.n_action_steps=8")),
+        (hdp_train, PLANNER_FLAGS),
+    ],
     ids=["diffusion", "hdp"],
 )
-def test_lerobot_trains_its_own_diffusion_policy_on_it_and_the_planner(dataset, tmp_path, policy_flags):
-    result = run_command(
-        "lerobot-train",
+def test_lerobot_trains_its_own_diffusion_policy_on_it_and_hdp_train_the_planner(
+    dataset, tmp_path, script, policy_flags
+):
+    log = call_command(
+        script.main,
         *policy_flags,
         "--policy.push_to_hub=false",
         "--policy.device=cpu",
@@ -201,6 +208,6 @@ def test_lerobot_trains_its_own_diffusion_policy_on_it_and_the_planner(dataset, 
         "--log_freq=1",
         "--num_workers=0",
     )
-    assert "step:2" in result.stderr
+    assert "step:2" in log
     weights = load_file(tmp_path / "run/checkpoints/last/pretrained_model/model.safetensors")
     assert any("backbone" in name for name in weights)

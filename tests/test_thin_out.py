@@ -8,18 +8,19 @@ from lerobot.datasets import LeRobotDataset
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
 from dataset_tools.thin_out import thin_out
 from gym_hdp_tasks.env_config import HDPEnv
+from lerobot_hdp.scripts import hdp_train
 
-from .conftest import HORIZON, run_command
+from .conftest import HORIZON, call_command
 
 IMAGE = "observation.images.front"
 STARTS, STOPS = [0, 5, 10, 15], [5, 10, 15, HORIZON]
 """Frames of an episode of 19 that become one: observed at the first, acted until the last."""
 
 
-@pytest.fixture
-def thinned(dataset_root, tmp_path) -> LeRobotDataset:
+@pytest.fixture(scope="module")
+def thinned(dataset_root, tmp_path_factory) -> LeRobotDataset:
     dataset = LeRobotDataset("test/sorting", root=dataset_root, episodes=[3, 5], video_backend="pyav")
-    return thin_out(dataset, 5, "test/thinned", tmp_path / "thinned")
+    return thin_out(dataset, 5, "test/thinned", tmp_path_factory.mktemp("datasets") / "thinned")
 
 
 def test_a_frame_has_the_first_observation_and_the_last_action_of_those_it_stands_for(dataset, thinned):
@@ -42,7 +43,7 @@ def test_a_planner_trains_on_it(thinned, tmp_path):
     flags = ["--dataset.repo_id=test/thinned", f"--dataset.root={thinned.root}", "--dataset.video_backend=pyav"]
     flags += ["--policy.type=hdp", "--policy.horizon=4", "--policy.num_layers=1", "--policy.width=32"]
     flags += ["--policy.push_to_hub=false", "--batch_size=2", "--steps=1", "--env_eval_freq=0"]
-    run_command("hdp-train", *flags, f"--output_dir={tmp_path / 'run'}")
+    call_command(hdp_train.main, *flags, f"--output_dir={tmp_path / 'run'}")
     assert (tmp_path / "run/checkpoints/000001/pretrained_model/model.safetensors").exists()
 
 

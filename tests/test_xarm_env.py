@@ -124,14 +124,20 @@ def test_a_copy_goes_on_from_the_same_state_and_leaves_the_original_alone(obs_ty
 
 @pytest.mark.parametrize("gym_id", IDS)
 def test_an_episode_lasts_its_horizon_and_pays_at_its_end(gym_id):
+    """Sorting is solved from its start on, the others never."""
     env = make(gym_id)
-    observation, info = env.reset(seed=0)
+    observation, info = env.reset(seed=0, options={"order": [0, 1, 2]})
+    solved = gym_id == "hdp/XArmSorting-v0"
+    assert (info["score"] == 1) == solved
+    assert not info["is_success"]
     stay = observation["agent_pos"]
     horizon = env.planning_task.horizon
     steps = [env.step(stay) for _ in range(horizon)]
     assert [truncated for _, _, _, truncated, _ in steps] == [False] * (horizon - 1) + [True]
-    assert all(reward == 0 for _, reward, *_ in steps[:-1])
-    assert not any(terminated or info["is_success"] for _, _, terminated, _, info in steps)
+    assert [reward for _, reward, *_ in steps[:-1]] == [0] * (horizon - 1)
+    assert (steps[-1][1] == 1) == solved
+    assert [step_info["is_success"] for *_, step_info in steps] == [False] * (horizon - 1) + [solved]
+    assert not any(terminated for _, _, terminated, _, _ in steps)
     assert set(info) == set(steps[-1][-1])
     assert gym.spec(gym_id).max_episode_steps == horizon
 

@@ -23,7 +23,7 @@ def scored(gym_id, places):
     for name in env.object_names[:3]:
         env.set_object_pose(name, places.get(name, (*FAR[name], ON_TABLE)))
     env.update_poses()
-    return env.score(), env._info(clipped=False)
+    return env.score(), env.end_episode(clipped=False)
 
 
 @pytest.mark.parametrize(
