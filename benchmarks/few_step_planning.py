@@ -20,7 +20,6 @@ from .machine import RESULTS, describe_run
 from .pages import DOCS, markdown_table
 
 FOLDER = RESULTS / "few_step_planning"
-VARIETY_FILE = RESULTS / "plan_variety.json"
 PAGE = DOCS / "few_steps.md"
 FIRST_SEED = 2_000_000
 WAYS: dict[str, dict[str, Any]] = {
@@ -53,18 +52,6 @@ Each section names what made it, as the command was at that commit (today, ways 
 
 """
 
-VARIETY = """## How many different plans
-
-In tool use, the demonstrations choose one of 36 plans uniformly, whatever the start. A planner that has learned this
-makes about 35 of them in as many starts: the effective number is the exponential of the entropy of the plans' shares,
-and less means that it prefers some. (More means that it also makes invalid ones.)
-
-Revealing what the planner is surest of prefers plans that are a little more probable, most of all where symbols lead
-and decide alone. That is part of what makes plans in few calls valid. Where variety counts, set
-`--policy.symbol_lead=0`, or use `ddim` with more calls.
-
-"""
-
 
 def evaluate_way(checkpoint: Path, way: str, calls: int, starts: int) -> dict[str, Any]:
     """Plan and execute some fresh starts."""
@@ -89,27 +76,7 @@ def write_page() -> None:
             for calls in sorted({key[1] for key in cells})
         ]
         page += markdown_table(["calls", *ways], rows) + "\n"
-    PAGE.write_text(page + _variety())
-
-
-def _variety() -> str:
-    """What `plan_variety` has measured."""
-    if not VARIETY_FILE.exists():
-        return ""
-    contents = list(json.loads(VARIETY_FILE.read_text()).values())
-    rows = [
-        [
-            f"`{result['planner']}`",
-            result["way"],
-            str(result["calls"]),
-            f"{result['effective_number']:.1f}",
-            f"{100 * result['valid']:.1f} %",
-        ]
-        for result in (content["result"] for content in contents)
-    ]
-    made_by = sorted({f"`{run['command']}`, code of {run['git_commit']}" for run in (c["run"] for c in contents)})
-    table = markdown_table(["planner", "way", "calls", "effective number of plans", "valid"], rows)
-    return VARIETY + table + "\n" + "\n\n".join(made_by) + "\n"
+    PAGE.write_text(page.rstrip() + "\n")
 
 
 def _percent(point: dict[str, Any] | None) -> str:

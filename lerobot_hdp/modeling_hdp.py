@@ -133,8 +133,8 @@ class HDPPolicy(PreTrainedPolicy):
             self._check_can_score()
         if dataset_meta is not None:
             keep_data_order_on_resume()
-        if dataset_meta is not None and config.plans_whole_episodes:
-            _check_episodes_fit(config, dataset_meta.episodes["length"])
+            if config.plans_whole_episodes:
+                _check_episodes_fit(config, dataset_meta.episodes["length"])
         self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
         self.motion_process, self.symbol_process = make_processes(config)
 

@@ -16,7 +16,15 @@ from .conftest import REPOSITORY
 
 SHIPPED = REPOSITORY / "checkpoints"
 MODULES = sorted(module.name for module in pkgutil.iter_modules(benchmarks.__path__))
-PAGES = ("ablations", "conditioning_tables", "few_step_planning", "growth", "planner_latency", "training_speed")
+PAGES = (
+    "ablations",
+    "conditioning_tables",
+    "few_step_planning",
+    "growth",
+    "plan_variety",
+    "planner_latency",
+    "training_speed",
+)
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -59,6 +67,7 @@ def test_the_comparison_of_planners_is_what_the_committed_results_make(tmp_path,
         ("planner_latency", ["--rounds=2", "--batch_sizes", "1", "--num_layers=1", "--width=32"]),
         ("growth", ["--rounds=2", "--horizons", "37", "--blocks", "2", "--batch_size=2"]),
         ("few_step_planning", [f"{SHIPPED}/xarm_arrange_blocks", "--starts=2", "--calls", "2", "--ways", "ddpm"]),
+        ("plan_variety", [f"{SHIPPED}/xarm_tool_use", "--starts=2"]),
         ("doing_nothing", ["--starts=2", "--tasks", "xarm_arrange_blocks"]),
     ],
 )
