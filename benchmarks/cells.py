@@ -12,7 +12,7 @@ import shutil
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -39,10 +39,11 @@ FIRST_EVALUATION_SEED = 1_000_000
 POLL_S = 1.0
 SHORTEST_TRAINING_S = 30.0
 """A training that the budget leaves less time for is not begun."""
-CORES_TO_EVALUATE_MEANWHILE = 4
+CORES_TO_EVALUATE_MEANWHILE, BESIDE_A_GPU = 4, 2
 """As many must belong to a cell for it to be evaluated while it trains; with fewer, evaluation would slow training."""
 TRAIN_S = "train_s.json"
 """In a checkpoint's folder, written last: the seconds of training up to it. A checkpoint without it is incomplete."""
+os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")  # else what asks for a GPU on import breaks CUDA in forks
 PROCESSES = get_context("forkserver")
 PROCESSES.set_forkserver_preload([__name__])  # so that LeRobot is imported once, not by every training
 
@@ -243,13 +244,16 @@ class Deadline:
         return self.at - time.monotonic()
 
 
-def run_cells(cells: list[Cell], processes: int = 1, budget_minutes: float | None = None) -> None:
+def run_cells(
+    cells: list[Cell], processes: int = 1, budget_minutes: float | None = None, train_flags: Sequence[str] = ()
+) -> None:
     """Run what is missing of some cells, in their order.
 
     Args:
         cells: to run.
         processes: cells at a time; they share the cores.
         budget_minutes: when it is spent, trainings stop with a checkpoint, and nothing more is begun.
+        train_flags: further ones of `hdp-train`, for this machine.
 
     Raises:
         SystemExit: a cell failed; the others have been run.
@@ -265,7 +269,7 @@ def run_cells(cells: list[Cell], processes: int = 1, budget_minutes: float | Non
             record_dataset(cell, num_workers=os.cpu_count() or 1)
     failed = []
     with ThreadPoolExecutor(processes) as executor:
-        futures = {executor.submit(run_cell, cell, threads, deadline): cell for cell in missing}
+        futures = {executor.submit(run_cell, cell, threads, deadline, train_flags): cell for cell in missing}
         try:
             for future in as_completed(futures):
                 if error := future.exception():
@@ -282,13 +286,13 @@ def run_cells(cells: list[Cell], processes: int = 1, budget_minutes: float | Non
         raise SystemExit(f"failed, see above: {', '.join(failed)}. Call again to go on with them.")
 
 
-def run_cell(cell: Cell, threads: int = 1, deadline: Deadline | None = None) -> str:
+def run_cell(cell: Cell, threads: int = 1, deadline: Deadline | None = None, train_flags: Sequence[str] = ()) -> str:
     """Train and evaluate a cell from where it stopped; write its result if it comes to an end.
 
     Args:
         cell: to run.
         threads: of PyTorch, for training and for evaluation.
-        deadline: see `run_cells`.
+        deadline, train_flags: see `run_cells`.
 
     Returns:
         One line that says how it went.
@@ -304,7 +308,7 @@ def run_cell(cell: Cell, threads: int = 1, deadline: Deadline | None = None) -> 
         if cell.last_step < cell.steps:
             if deadline.seconds_left < SHORTEST_TRAINING_S:
                 return f"{cell.name}: {cell.state()}, no time left"
-            train(cell, threads, deadline)
+            train(cell, threads, deadline, train_flags)
         else:
             note_run(cell)
         evaluate_checkpoints(cell, threads, deadline)
@@ -317,13 +321,13 @@ def run_cell(cell: Cell, threads: int = 1, deadline: Deadline | None = None) -> 
     return f"{cell.name}: success {progress.curve[-1]['success_rate']:.0%} in the end, {result['train_s'] / 60:.1f} min"
 
 
-def train(cell: Cell, threads: int, deadline: Deadline) -> None:
+def train(cell: Cell, threads: int, deadline: Deadline, train_flags: Sequence[str] = ()) -> None:
     """Run `hdp-train` from the last checkpoint on, with its output in `train.log` in the cell's folder.
 
     It ends at the deadline, with a checkpoint. Where there are cores for it, checkpoints are evaluated meanwhile.
     """
-    training = start_training(cell, threads, deadline)
-    evaluate_meanwhile = threads >= CORES_TO_EVALUATE_MEANWHILE
+    training = start_training(cell, threads, deadline, train_flags)
+    evaluate_meanwhile = threads >= (BESIDE_A_GPU if torch.cuda.is_available() else CORES_TO_EVALUATE_MEANWHILE)
     try:
         while training.is_alive():
             time.sleep(POLL_S)
@@ -338,7 +342,7 @@ def train(cell: Cell, threads: int, deadline: Deadline) -> None:
         training.join()
 
 
-def start_training(cell: Cell, threads: int, deadline: Deadline) -> BaseProcess:
+def start_training(cell: Cell, threads: int, deadline: Deadline, train_flags: Sequence[str] = ()) -> BaseProcess:
     """Start or resume `hdp-train` in a process of its own."""
     train_s = 0.0
     if last := cell.last_checkpoint:
@@ -351,6 +355,7 @@ def start_training(cell: Cell, threads: int, deadline: Deadline) -> BaseProcess:
         config_file = cell.folder / "train_config.json"
         _write_json(config_file, cell.train_config())
         arguments = [f"--config_path={config_file}"]
+    arguments += train_flags
     if deadline.seconds_left < math.inf:
         arguments.append(f"--max_train_minutes={deadline.seconds_left / 60:.3f}")
     note_run(cell)
@@ -415,7 +420,7 @@ def _evaluate(cell: Cell, checkpoint: Path, threads: int) -> dict[str, Any]:
 
 
 def _evaluate_into(path: Path, starts: int, first_seed: int, outcome: Path) -> None:
-    _write_json(outcome, evaluate(path, starts, first_seed))
+    _write_json(outcome, evaluate(path, starts, first_seed, compile_model=False))  # it takes longer than the plans
 
 
 def result_of(cell: Cell, progress: Progress) -> dict[str, Any]:

@@ -51,7 +51,7 @@ WHAT_THE_SETTINGS_ARE = """\
 - AdamW is fused on CUDA; `--policy.optimizer_fused=false` switches that off.
 - Compiled: `--policy.compile_model=true`, the denoiser through `torch.compile`; with CUDA graphs:
   `--policy.compile_mode=reduce-overhead`.
-- Muon (PyTorch's own, `--policy.optimizer_type=muon`) updates one matrix after the other, some thousand small kernels.
+- Muon (`--policy.optimizer_type=muon`) updates all matrices of one shape together.
 - Attention is PyTorch's `scaled_dot_product_attention`, with the kernel that PyTorch chooses.
 
 The dataset stays in the host's memory. The host waits for the device three times a step: for the losses in the log, and
@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--symbolic_horizon", type=int, default=108)
     parser.add_argument("--num_layers", type=int, default=8)
     parser.add_argument("--width", type=int, default=256)
-    parser.add_argument("--batch_size", type=int, default=64)
+    parser.add_argument("--batch_size", type=int, default=50, help="one that divides the episodes, to be compiled once")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
     parser.add_argument("--steps", type=int, default=20, help="of a round")

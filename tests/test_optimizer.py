@@ -10,7 +10,7 @@ from lerobot.optim import AdamWConfig, load_optimizer_state, save_optimizer_stat
 from torch.optim import Optimizer
 
 from lerobot_hdp import HDPConfig
-from lerobot_hdp.optimizer import FusedAdamWConfig, MuonAdamW, MuonAdamWConfig, parameter_groups
+from lerobot_hdp.optimizer import BatchedMuon, FusedAdamWConfig, MuonAdamW, MuonAdamWConfig, parameter_groups
 
 from .conftest import TINY_PLANNER
 
@@ -98,6 +98,24 @@ def test_muon_moves_all_directions_of_a_matrix_alike():
     step = torch.linalg.svdvals(matrix.detach())
     assert step.max() < 3 * step.min()  # the gradient's largest singular value is 1,000 times its smallest
     assert ((matrix * gradient).sum(dim=1) < 0).all()  # downhill in each of them
+
+
+def test_muon_updates_matrices_as_pytorchs_does_one_by_one():
+    torch.manual_seed(0)
+    shapes = [(8, 16), (16, 8), (8, 16), (8, 8)]
+    gradients = [[torch.randn(shape) for shape in shapes] for _ in range(3)]
+    starts = [torch.randn(shape) for shape in shapes]
+    ends = []
+    for kind, options in ((BatchedMuon, {}), (torch.optim.Muon, {"adjust_lr_fn": "match_rms_adamw"})):
+        matrices = [torch.nn.Parameter(start.clone()) for start in starts]
+        optimizer = kind(matrices, lr=0.1, weight_decay=0.1, momentum=0.9, **options)
+        for gradient in gradients:
+            for matrix, its_own in zip(matrices, gradient, strict=True):
+                matrix.grad = its_own.clone()
+            optimizer.step()
+        ends.append(matrices)
+    for found, expected, start in zip(*ends, starts, strict=True):
+        assert (found - expected).norm() < 0.03 * (expected - start).norm()  # bfloat16 has 3 digits
 
 
 def test_muons_steps_are_as_large_as_adamws():

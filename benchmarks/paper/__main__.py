@@ -10,6 +10,7 @@ again, an interrupted one goes on. `--pack` and `--unpack` are for machines with
 """
 
 import argparse
+import shlex
 from pathlib import Path
 
 from ..cells import run_cells
@@ -31,6 +32,12 @@ def main() -> None:
     )
     parser.add_argument("--budget_minutes", type=float, help="stop with checkpoints when it is spent")
     parser.add_argument("--processes", type=int, default=1, help="cells at a time, which share the cores")
+    parser.add_argument(
+        "--train_flags",
+        type=shlex.split,
+        default=[],
+        help='further ones of hdp-train, for this machine: --train_flags="--policy.compile_model=true"',
+    )
     action = parser.add_mutually_exclusive_group()
     action.add_argument("--list", action="store_true", help="say what is finished and what is missing")
     action.add_argument("--report", action="store_true", help="write docs/results.md")
@@ -64,7 +71,7 @@ def main() -> None:
     elif options.join:
         join_files(options.join)
     else:
-        run_cells(cells, options.processes, options.budget_minutes)
+        run_cells(cells, options.processes, options.budget_minutes, options.train_flags)
 
 
 if __name__ == "__main__":
