@@ -2,6 +2,7 @@
 
 import logging
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -15,6 +16,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from torchvision.models import get_model_weights
 
 from .optimizer import OPTIMIZERS, FusedAdamWConfig, MuonAdamWConfig
+from .precision import bfloat16_is_fast
 from .processes.gaussian import PREDICTION_TYPES
 from .processes.masked import MASK_SCHEDULES
 from .prompt import encode_prompt
@@ -133,7 +135,8 @@ class HDPConfig(PreTrainedConfig):
         num_candidates: plans that are drawn for each observation, of which the most likely is executed.
 
         compile_model, compile_mode: run the denoiser through `torch.compile`.
-        dtype: `float32`, or `bfloat16` for autocast: of all in training, of the denoiser in planning.
+        dtype: `float32`, or `bfloat16` for autocast: of all in training, of the denoiser in planning. A CPU that has no
+            instructions for it computes in float32.
 
         optimizer_type: `muon` updates the matrices between hidden layers by Muon and the rest by AdamW (optimizer.py),
             `adamw` all by AdamW.
@@ -239,6 +242,9 @@ class HDPConfig(PreTrainedConfig):
             choices = [str(weights) for weights in get_model_weights(self.vision_backbone)]
             _check_choice("pretrained_backbone_weights", self.pretrained_backbone_weights, choices)
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
+        if self.dtype == "bfloat16" and not bfloat16_is_fast(self.device):
+            warnings.warn("this CPU has no bfloat16 instructions: computing in float32, which is faster", stacklevel=2)
+            self.dtype = "float32"
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
         for name in AT_LEAST_1:

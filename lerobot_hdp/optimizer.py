@@ -13,6 +13,8 @@ from lerobot.optim.optimizers import OptimizerParams
 from torch import Tensor, nn
 from torch.optim import Muon, Optimizer
 
+from .precision import bfloat16_is_fast
+
 OPTIMIZERS = ["muon", "adamw"]
 """Values of `HDPConfig.optimizer_type`."""
 FOR_MUON = "for_muon"
@@ -112,7 +114,7 @@ def _by_shape(parameters: list[nn.Parameter]) -> dict[torch.Size, list[int]]:
 def orthogonalise(matrices: Tensor, coefficients: tuple[float, float, float], steps: int, eps: float) -> Tensor:
     """Bring all singular values of some matrices near 1, by Newton-Schulz iterations (Jordan et al. 2024).
 
-    In bfloat16, as PyTorch does, but in float32 on a CPU whose matrix products are many times slower in bfloat16.
+    In bfloat16, as PyTorch does, or in float32 where that is faster.
 
     Args:
         matrices: (n, rows, columns).
@@ -125,8 +127,8 @@ def orthogonalise(matrices: Tensor, coefficients: tuple[float, float, float], st
     """
     a, b, c = coefficients
     is_tall = matrices.shape[1] > matrices.shape[2]
-    slow = matrices.device.type == "cpu" and not torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    x = (matrices.mT if is_tall else matrices).to(torch.float32 if slow else torch.bfloat16)
+    dtype = torch.bfloat16 if bfloat16_is_fast(matrices.device) else torch.float32
+    x = (matrices.mT if is_tall else matrices).to(dtype)
     x = x / x.norm(dim=(1, 2), keepdim=True).clamp(min=eps)
     for _ in range(steps):
         gram = x @ x.mT

@@ -22,7 +22,7 @@ from safetensors.torch import load_file
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gym_hdp_tasks.env_config import HDPEnv
-from lerobot_hdp import PlanPrompt
+from lerobot_hdp import PlanPrompt, configuration_hdp
 from lerobot_hdp.prompt import encode_prompt
 
 from .conftest import (
@@ -278,7 +278,8 @@ class TestContract:
         assert not torch.equal(plan.actions[:, 7:], inputs["action"][:, 7:])
         assert (plan.candidate is not None) == policy.can_score
 
-    def test_bfloat16_can_be_switched_on(self, make_planner, batch, training_batch, planner):
+    def test_bfloat16_can_be_switched_on(self, make_planner, batch, training_batch, planner, monkeypatch):
+        monkeypatch.setattr(configuration_hdp, "bfloat16_is_fast", lambda device: True)
         plans = []
         for dtype in ("float32", "bfloat16"):
             policy, preprocessor, _ = make_planner(planner, dtype=dtype)

@@ -414,6 +414,13 @@ def test_a_policy_goes_on_from_the_state_that_it_loads(make_planner, batch):
     assert all(torch.equal(value, ahead.state_dict()[name]) for name, value in behind.state_dict().items())
 
 
+def test_a_cpu_without_bfloat16_computes_in_float32_with_a_warning(monkeypatch):
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    with pytest.warns(UserWarning, match="no bfloat16 instructions"):
+        config = HDPConfig(dtype="bfloat16", device="cpu")
+    assert config.dtype == "float32"
+
+
 @pytest.mark.parametrize("trains", [True, False])
 def test_attention_is_pytorchs_in_training_with_bfloat16_too(trains):
     plain = torch.nn.TransformerDecoderLayer(32, 4, 64, 0.0, batch_first=True, norm_first=True)
