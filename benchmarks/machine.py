@@ -21,6 +21,7 @@ def describe_run() -> dict[str, object]:
         "command": "python -m " + shlex.join([_module_name(), *sys.argv[1:]]),
         "git_commit": git_commit(),
         "cpu": _cpu_name(),
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),  # with AVX2 alone, training computes in float32
         "cores": os.cpu_count(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "python": platform.python_version(),

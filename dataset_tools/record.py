@@ -27,7 +27,7 @@ from huggingface_hub import get_token
 from lerobot.configs import parser
 from lerobot.datasets import dataset_writer
 from lerobot.datasets.aggregate import aggregate_datasets
-from lerobot.datasets.io_utils import load_info, write_info
+from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.language import language_feature_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import INFO_PATH, create_lerobot_dataset_card
@@ -57,6 +57,9 @@ EPISODES_PER_SHARD = 25
 """At most. A short recording has smaller shards, ..."""
 FEWEST_SHARDS = 8
 """... at least so many, so that all processes have work."""
+RECORDING_PATH = "meta/hdp_recording.json"
+"""What only one recording has, the seeds that its episodes follow from. LeRobot merges datasets with equal features, so
+that it is not told there; what it edits or merges has no such file."""
 MOST_ATTEMPTS = 100
 """Demonstrations of one episode that may fail."""
 
@@ -226,7 +229,6 @@ def dataset_features(config: RecordConfig) -> dict[str, dict[str, Any]]:
                 "vocabulary": list(task.vocabulary),
                 "gym_id": task.gym_id,
                 "parameters": task.parameters,
-                "seed": config.seed,
             },
         ),
         REWARD: column("float32", None, 1),
@@ -453,8 +455,9 @@ def _is_complete_dataset(config: RecordConfig) -> bool:
     language = language_feature_info() if config.dataset.language else {}
     if info.total_episodes != config.dataset.num_episodes or columns(info.features) != columns({**wanted, **language}):
         return False
-    explanation = info.features[SYMBOLIC_PLAN].get("info") or {}
-    return {**explanation, **wanted[SYMBOLIC_PLAN]["info"]} == explanation
+    recording = config.root / RECORDING_PATH
+    is_same_task = info.features[SYMBOLIC_PLAN].get("info") == wanted[SYMBOLIC_PLAN]["info"]
+    return is_same_task and recording.exists() and json.loads(recording.read_text())["seed"] == config.seed
 
 
 def try_environment(config: RecordConfig) -> None:
@@ -517,16 +520,12 @@ def _merge(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) ->
 
     if config.dataset.language:
         write_language_columns(merged, config.env.planning_task.vocabulary)
-    info = load_info(merged)
-    info.features[SYMBOLIC_PLAN]["info"] |= {
-        "num_episodes": info.total_episodes,  # a dataset that was edited has another number
-        "failed_attempts": {str(k): v for k, v in sorted(failed.items())},
-    }
-    write_info(info, merged)
+    recording = {"seed": config.seed, "num_episodes": config.dataset.num_episodes, "failed_attempts": failed}
+    (merged / RECORDING_PATH).write_text(json.dumps(recording, indent=4, sort_keys=True))
     dataset = LeRobotDataset(repo_id, root=merged, video_backend="pyav")
     card = create_lerobot_dataset_card(
         tags=[*CARD_TAGS, *config.dataset.tags],
-        dataset_info=info,
+        dataset_info=dataset.meta.info,
         license="apache-2.0",
         dataset_description=describe(config.env.planning_task, dataset),
     )

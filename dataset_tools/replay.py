@@ -1,5 +1,6 @@
 """Execute a dataset's actions again, from the seeds that it was recorded with."""
 
+import json
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -10,7 +11,7 @@ from lerobot.utils.constants import ACTION, REWARD
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 
 from .language import SYMBOLIC_PLAN
-from .record import episode_seed
+from .record import RECORDING_PATH, episode_seed
 
 
 class Recording(NamedTuple):
@@ -38,22 +39,30 @@ class Recording(NamedTuple):
 def load_recording(dataset: LeRobotDataset) -> Recording:
     """Actions and scores of a dataset that `hdp-record` wrote, or of some of its episodes, with their seeds.
 
-    The seeds follow from the metadata and from the episodes' indices.
+    The seeds follow from `RECORDING_PATH` and from the episodes' indices.
 
     Raises:
-        ValueError: episodes were added or removed since, so that the indices are others.
+        ValueError: the dataset is no recording, or episodes were added since.
     """
-    info, total = dataset.meta.features[SYMBOLIC_PLAN]["info"], dataset.meta.total_episodes
-    recorded = info.get("num_episodes", total)  # which older recordings do not tell
-    if total != recorded:
+    path, total = dataset.root / RECORDING_PATH, dataset.meta.total_episodes
+    if not path.exists():
         raise ValueError(
-            f"{dataset.root} has {total} episodes and was recorded with {recorded}: which seeds they have is not known"
+            f"{dataset.root} has no {RECORDING_PATH}: hdp-record did not write it, or it was edited: which seeds its "
+            "episodes have is not known"
+        )
+    recording = json.loads(path.read_text())
+    if total != recording["num_episodes"]:
+        raise ValueError(
+            f"{dataset.root} has {total} episodes and was recorded with {recording['num_episodes']}: which seeds they "
+            "have is not known"
         )
     rows = dataset.hf_dataset.with_format("numpy")
     episodes = np.unique(rows["episode_index"][:])
-    seeds = [episode_seed(info["seed"], i, info["failed_attempts"].get(str(i), 0)) for i in episodes.tolist()]
+    failed = recording["failed_attempts"]
+    seeds = [episode_seed(recording["seed"], i, failed.get(str(i), 0)) for i in episodes.tolist()]
     plans = np.stack(rows[ACTION]).reshape(len(seeds), -1, dataset.meta.shapes[ACTION][0])
     scores = np.stack(rows[REWARD]).reshape(len(seeds), -1)[:, -1]
+    info = dataset.meta.features[SYMBOLIC_PLAN]["info"]
     return Recording(info["gym_id"], info["parameters"], seeds, plans, scores)
 
 

@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import psutil
 import pytest
 from draccus.utils import ParsingError
 from huggingface_hub import DatasetCard
-from lerobot.datasets.dataset_tools import delete_episodes
+from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -25,6 +26,7 @@ from dataset_tools import record as recorder
 from dataset_tools import record_on_cluster as cluster
 from dataset_tools.experts import EXPERTS
 from dataset_tools.record import (
+    RECORDING_PATH,
     RecordConfig,
     RecordDatasetConfig,
     episode_seed,
@@ -75,7 +77,8 @@ def test_a_dataset_explains_itself(dataset_root):
     assert info["vocabulary"] == ["PAD", "A", "B", "PICK", "PLACE", "S1", "S2", "AUX"]
     assert info["gym_id"] == "hdp/BlockSorting2D-v0"
     assert info["parameters"] == {"n_blocks": 2, "waypoints_per_pose": 1}
-    assert (info["seed"], info["num_episodes"], info["failed_attempts"]) == (0, N_EPISODES, {})
+    recording = json.loads((dataset_root / RECORDING_PATH).read_text())
+    assert recording == {"seed": 0, "num_episodes": N_EPISODES, "failed_attempts": {}}
 
 
 def test_episodes_are_whole_and_successful(recorded):
@@ -114,15 +117,25 @@ def test_some_episodes_of_a_recording_replay_from_their_own_seeds(dataset_root):
 
 def test_a_recording_that_was_edited_does_not_replay_from_wrong_seeds(dataset, tmp_path):
     shorter = delete_episodes(dataset, [0], output_dir=tmp_path / "shorter", repo_id="test/shorter")
-    with pytest.raises(ValueError, match=f"has {N_EPISODES - 1} episodes and was recorded with {N_EPISODES}"):
+    with pytest.raises(ValueError, match="which seeds its episodes have is not known"):
         load_recording(shorter)
 
 
-def test_a_recording_that_does_not_tell_its_number_of_episodes_replays(dataset, monkeypatch):
-    info = dict(dataset.meta.features["observation.symbolic_plan"]["info"])
-    del info["num_episodes"]  # as before it was written
-    monkeypatch.setitem(dataset.meta.features["observation.symbolic_plan"], "info", info)
-    assert len(load_recording(dataset).seeds) == N_EPISODES
+def test_a_recording_with_further_episodes_does_not_replay(dataset_root, tmp_path):
+    copy = shutil.copytree(dataset_root, tmp_path / "copy")
+    recording = json.loads((copy / RECORDING_PATH).read_text())
+    (copy / RECORDING_PATH).write_text(json.dumps({**recording, "num_episodes": N_EPISODES - 1}))
+    with pytest.raises(ValueError, match=f"has {N_EPISODES} episodes and was recorded with {N_EPISODES - 1}"):
+        load_recording(LeRobotDataset("test/sorting", root=copy, video_backend="pyav"))
+
+
+def test_recordings_from_different_seeds_can_be_merged(tmp_path):
+    parts = [record(replace(config_of(2, tmp_path / f"seed_{seed}"), seed=seed)) for seed in (1, 2)]
+    merged = merge_datasets(parts, output_repo_id="test/merged", output_dir=tmp_path / "merged")
+    starts = columns(merged.root)["observation.environment_state"].reshape(4, -1)
+    assert len(np.unique(starts, axis=0)) == 4
+    with pytest.raises(ValueError, match="which seeds its episodes have is not known"):
+        load_recording(merged)
 
 
 def test_the_result_does_not_depend_on_the_number_of_processes(dataset_root, tmp_path):
@@ -219,7 +232,7 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_pa
         record(config)
     record(replace(config, resume=True))
     assert_same_dataset(tmp_path / "stopped", uninterrupted)
-    assert load_info(config.root).features["observation.symbolic_plan"]["info"]["num_episodes"] == 80
+    assert json.loads((config.root / RECORDING_PATH).read_text())["num_episodes"] == 80
     assert not config.partial_root.exists()
 
 
@@ -376,7 +389,7 @@ def test_failed_demonstrations_are_dropped_and_counted_also_across_an_interrupti
         record(config)
     done_before = load_info(config.partial_root / "episodes_000000").total_episodes
     dataset = record(replace(config, resume=True))
-    failed = dataset.meta.features["observation.symbolic_plan"]["info"]["failed_attempts"]
+    failed = json.loads((dataset.root / RECORDING_PATH).read_text())["failed_attempts"]
     assert dataset.num_episodes == 10
     assert columns(tmp_path / "careless")["next.success"].reshape(10, HORIZON)[:, -1].all()
     assert min(map(int, failed)) < done_before <= max(map(int, failed))

@@ -307,13 +307,18 @@ def training_time(results: Results) -> str:
             for method in METHODS:
                 contents = results.get((preset, task, method), [])
                 for run in (run for content in contents for run in all_runs(content)):
-                    machines.add(run["gpu"] or f"{run['cpu']}, {run['cores']} cores")
+                    machines.add(run["gpu"] or _cpu(run))
                 minutes = [content["result"]["train_s"] / 60 for content in contents]
                 speeds = [content["result"]["samples_per_second"] for content in contents]
                 missing = MISSING if exists(method, preset, task) else ""
                 row.append(f"{mean(minutes):.1f} min, {mean(speeds):.0f}/s" if contents else missing)
             rows.append([*row, "; ".join(sorted(machines))])
     return markdown_table(["task, preset", *LABELS.values(), "machine"], rows)
+
+
+def _cpu(run: dict[str, Any]) -> str:
+    instructions = f" with {run['cpu_capability']}" if "cpu_capability" in run else ""
+    return f"{run['cpu']}{instructions}, {run['cores']} cores"
 
 
 def failures(results: Results) -> str:
