@@ -39,8 +39,8 @@ FIRST_EVALUATION_SEED = 1_000_000
 POLL_S = 1.0
 SHORTEST_TRAINING_S = 30.0
 """A training that the budget leaves less time for is not begun."""
-CORES_TO_EVALUATE_MEANWHILE, BESIDE_A_GPU = 4, 2
-"""As many must belong to a cell for it to be evaluated while it trains; with fewer, evaluation would slow training."""
+CORES_TO_EVALUATE_MEANWHILE = {"cpu": 4, "cuda": 2}
+"""By the device that trains. As many must belong to a cell for it to be evaluated meanwhile, which else slows it."""
 TRAIN_S = "train_s.json"
 """In a checkpoint's folder, written last: the seconds of training up to it. A checkpoint without it is incomplete."""
 os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")  # else what asks for a GPU on import breaks CUDA in forks
@@ -327,7 +327,7 @@ def train(cell: Cell, threads: int, deadline: Deadline, train_flags: Sequence[st
     It ends at the deadline, with a checkpoint. Where there are cores for it, checkpoints are evaluated meanwhile.
     """
     training = start_training(cell, threads, deadline, train_flags)
-    evaluate_meanwhile = threads >= (BESIDE_A_GPU if torch.cuda.is_available() else CORES_TO_EVALUATE_MEANWHILE)
+    evaluate_meanwhile = threads >= CORES_TO_EVALUATE_MEANWHILE["cuda" if torch.cuda.is_available() else "cpu"]
     try:
         while training.is_alive():
             time.sleep(POLL_S)

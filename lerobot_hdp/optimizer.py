@@ -80,8 +80,7 @@ class MuonAdamWConfig(FusedAdamWConfig):
 class BatchedMuon(Muon):
     """PyTorch's Muon with `adjust_lr_fn="match_rms_adamw"`, which updates all matrices of one shape together.
 
-    PyTorch's updates one matrix after the other: for a network of 8 layers, some 1,700 kernels a step that leave a GPU
-    idle.
+    PyTorch's updates one matrix after the other, each by dozens of small kernels, between which a GPU is idle.
     """
 
     @torch.no_grad()

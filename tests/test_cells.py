@@ -98,7 +98,8 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(finished):
     training.join()
     (killed.folder / "train/checkpoints/last").unlink(missing_ok=True)  # as if killed while LeRobot moves it
     assert killed.state().startswith("trained ")
-    run_cell(killed)
+    run_cell(killed, train_flags=["--log_freq=7"])  # which changes nothing that is learned
+    assert json.loads((killed.last_checkpoint / "train_config.json").read_text())["log_freq"] == 7
     assert curve(killed) == curve(finished)
     weights = [load_file(each.last_checkpoint / "model.safetensors") for each in (killed, finished)]
     assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
