@@ -40,7 +40,7 @@ POLL_S = 1.0
 SHORTEST_TRAINING_S = 30.0
 """A training that the budget leaves less time for is not begun."""
 CORES_TO_EVALUATE_MEANWHILE = {"cpu": 4, "cuda": 2}
-"""By the device that trains. As many must belong to a cell for it to be evaluated meanwhile, which else slows it."""
+"""By the device that trains: with fewer, a cell is not evaluated meanwhile, because that would slow its training."""
 TRAIN_S = "train_s.json"
 """In a checkpoint's folder, written last: the seconds of training up to it. A checkpoint without it is incomplete."""
 os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")  # else what asks for a GPU on import breaks CUDA in forks

@@ -96,18 +96,14 @@ class BatchedMuon(Muon):
             torch._foreach_lerp_(momenta, gradients, 1 - group["momentum"])
             directions = torch._foreach_lerp(gradients, momenta, group["momentum"])  # Nesterov's
             torch._foreach_mul_(parameters, 1 - group["lr"] * group["weight_decay"])
-            for shape, indices in _by_shape(parameters).items():
-                stacked = torch.stack([directions[index] for index in indices])
+            same_shape = defaultdict(list)
+            for parameter, direction in zip(parameters, directions, strict=True):
+                same_shape[parameter.shape].append((parameter, direction))
+            for shape, pairs in same_shape.items():
+                matrices, stacked = [parameter for parameter, _ in pairs], torch.stack([each for _, each in pairs])
                 update = orthogonalise(stacked, group["ns_coefficients"], group["ns_steps"], group["eps"])
                 lr = 0.2 * math.sqrt(max(shape)) * group["lr"]
-                torch._foreach_add_([parameters[index] for index in indices], update.unbind(), alpha=-lr)
-
-
-def _by_shape(parameters: list[nn.Parameter]) -> dict[torch.Size, list[int]]:
-    indices = defaultdict(list)
-    for index, parameter in enumerate(parameters):
-        indices[parameter.shape].append(index)
-    return indices
+                torch._foreach_add_(matrices, update.unbind(), alpha=-lr)
 
 
 def orthogonalise(matrices: Tensor, coefficients: tuple[float, float, float], steps: int, eps: float) -> Tensor:
