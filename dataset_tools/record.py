@@ -211,7 +211,7 @@ def dataset_features(config: RecordConfig) -> dict[str, dict[str, Any]]:
 
     image = {
         "dtype": "video" if config.dataset.video else "image",
-        "shape": (env.camera_height, env.camera_width, 3),
+        "shape": (env.observation_height, env.observation_width, 3),
         "names": ["height", "width", "channels"],
     }
     columns = {

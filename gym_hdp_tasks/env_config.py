@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from .task import CAMERAS, OBS_TYPES, PlanningTask, are_cameras
+from .task import CAMERAS, OBS_TYPES, PlanningTask, parse_camera_names
 
 TASKS = {
     "BlockSorting2D-v0": "gym_hdp_tasks.block_sorting_2d:block_sorting_2d_task",
@@ -21,7 +21,7 @@ TASKS = {
 """Task name, as in `--env.task=`, to the function that states the task's facts. It is imported when the task is chosen:
 every command of LeRobot imports this module, also where there is no MuJoCo to be had."""
 BLOCK_SORTING_2D_ONLY = ("n_blocks", "waypoints_per_pose")
-XARM_ONLY = ("robot", "obs_type", "camera_names", "camera_height", "camera_width")
+XARM_ONLY = ("robot", "obs_type", "camera_name", "observation_height", "observation_width")
 """Fields of `HDPEnv` that not every task has."""
 
 
@@ -37,9 +37,9 @@ class HDPEnv(EnvConfig):
             (BlockSorting2D only).
         robot: `primitive`, or `menagerie` for MuJoCo Menagerie's model (X-Arm tasks only).
         obs_type: `state`, `pixels` or `pixels_state` (X-Arm tasks only).
-        camera_names: the cameras to observe, of `front` and `wrist` (X-Arm tasks only).
-        camera_height: of an observed image, in pixels (X-Arm tasks only).
-        camera_width: likewise.
+        camera_name: the cameras to observe: `front`, `wrist`, or `front,wrist` (X-Arm tasks only).
+        observation_height: of an observed image, in pixels (X-Arm tasks only).
+        observation_width: likewise.
         fps: actions per second, which the task decides.
 
     Raises:
@@ -51,24 +51,23 @@ class HDPEnv(EnvConfig):
     waypoints_per_pose: int = 3
     robot: str = "primitive"
     obs_type: str = "state"
-    camera_names: tuple[str, ...] = CAMERAS
-    camera_height: int = 128
-    camera_width: int = 128
+    camera_name: str = ",".join(CAMERAS)
+    observation_height: int = 128
+    observation_width: int = 128
     fps: int = EnvConfig.fps
     render_mode: str = "rgb_array"
 
     def __post_init__(self):
         try:
             task = self.planning_task
+            cameras = parse_camera_names(self.camera_name)
         except ValueError as error:  # LeRobot's commands show the message of draccus' own error only
             raise ParsingError(str(error)) from error
         if self.obs_type not in OBS_TYPES:
             raise ParsingError(f"--env.obs_type must be one of {OBS_TYPES}, got {self.obs_type!r}")
-        self.camera_names = tuple(self.camera_names)
-        if not are_cameras(self.camera_names):
-            raise ParsingError(f"--env.camera_names is a list, as [front], of {CAMERAS}, got {self.camera_names}")
-        if self.obs_type == "state" and self.camera_names != CAMERAS:
-            raise ParsingError("--env.camera_names chooses among images: add --env.obs_type=pixels, or pixels_state")
+        self.camera_name = ",".join(cameras)
+        if self.obs_type == "state" and cameras != CAMERAS:
+            raise ParsingError("--env.camera_name chooses among images: add --env.obs_type=pixels, or pixels_state")
         others = BLOCK_SORTING_2D_ONLY if self._is_xarm else XARM_ONLY
         for field in fields(self):
             if field.name in others and getattr(self, field.name) != field.default:
@@ -84,9 +83,9 @@ class HDPEnv(EnvConfig):
             self.features |= {"agent_pos": state, "environment_state": poses}
             self.features_map |= {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
         if self.obs_type != "state":
-            image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.camera_height, self.camera_width, 3))
-            self.features |= {f"pixels/{camera}": image for camera in self.camera_names}
-            self.features_map |= {f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in self.camera_names}
+            image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.observation_height, self.observation_width, 3))
+            self.features |= {f"pixels/{camera}": image for camera in cameras}
+            self.features_map |= {f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in cameras}
 
     def with_poses(self) -> "HDPEnv":
         """The same, where the objects' poses are observed, too: the task's checker of plans looks at them."""
@@ -127,8 +126,8 @@ class HDPEnv(EnvConfig):
         if self._is_xarm:
             kwargs |= {
                 "obs_type": self.obs_type,
-                "camera_names": self.camera_names,
-                "camera_height": self.camera_height,
-                "camera_width": self.camera_width,
+                "camera_name": self.camera_name,
+                "observation_height": self.observation_height,
+                "observation_width": self.observation_width,
             }
         return kwargs

@@ -55,9 +55,17 @@ class PlanningTask:
             raise ValueError(f"a vocabulary names each symbol once, got {self.vocabulary}")
 
 
-def are_cameras(names: Sequence[str]) -> bool:
-    """Whether these are some of `CAMERAS`, each once."""
-    return 0 < len(names) == len(set(names) & set(CAMERAS))
+def parse_camera_names(camera_name: str | Sequence[str]) -> tuple[str, ...]:
+    """`front,wrist`, as LeRobot's environments name several cameras, or a sequence of names, as these names.
+
+    Raises:
+        ValueError: they are not some of `CAMERAS`, each once.
+    """
+    names = camera_name.split(",") if isinstance(camera_name, str) else camera_name
+    names = tuple(name.strip() for name in names)
+    if not 0 < len(names) == len(set(names) & set(CAMERAS)):
+        raise ValueError(f"camera_name must be one of {CAMERAS}, or several, as front,wrist; got {camera_name!r}")
+    return names
 
 
 def equal_steps(steps: int, tokens: int, waypoints: int) -> tuple[tuple[int, int], ...]:

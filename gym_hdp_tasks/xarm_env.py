@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from .scene import BLOCK_HALF_SIZE, FRONT_CAMERA_FOVY, furnish
-from .task import CAMERAS, FRONT_CAMERA, OBS_TYPES, PlanningTask, are_cameras
+from .task import CAMERAS, FRONT_CAMERA, OBS_TYPES, PlanningTask, parse_camera_names
 from .waypoint_motion import WaypointMotion
 from .xarm7 import ARM_JOINTS, GRIPPERS, ROBOT_CONTYPE, TCP_SITE, robot_spec
 
@@ -51,9 +51,9 @@ class XArmEnv(gym.Env):
         planning_task: the task's facts.
         robot: one of `xarm7.ROBOTS`.
         obs_type: one of `OBS_TYPES`.
-        camera_names: the cameras to observe, from `CAMERAS`.
-        camera_height: of an observed image, in pixels.
-        camera_width: likewise.
+        camera_name: the cameras to observe, from `CAMERAS`: `front,wrist`, or a sequence of names.
+        observation_height: of an observed image, in pixels.
+        observation_width: likewise.
         render_mode: None or `rgb_array`.
 
     Raises:
@@ -75,25 +75,26 @@ class XArmEnv(gym.Env):
         planning_task: PlanningTask,
         robot: str = "primitive",
         obs_type: str = "state",
-        camera_names: tuple[str, ...] = CAMERAS,
-        camera_height: int = 128,
-        camera_width: int = 128,
+        camera_name: str | Sequence[str] = CAMERAS,
+        observation_height: int = 128,
+        observation_width: int = 128,
         render_mode: str | None = None,
     ):
         if obs_type not in OBS_TYPES:
             raise ValueError(f"obs_type must be one of {OBS_TYPES}, got {obs_type!r}")
-        if not are_cameras(camera_names):
-            raise ValueError(f"camera_names must name some of {CAMERAS}, each once, got {tuple(camera_names)}")
-        if min(camera_height, camera_width) < 1:
-            raise ValueError(f"a camera image has at least 1 pixel, got {camera_height} x {camera_width}")
+        if min(observation_height, observation_width) < 1:
+            raise ValueError(
+                f"observation_height and observation_width are at least 1 pixel, got {observation_height} x "
+                f"{observation_width}"
+            )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         self.planning_task = planning_task
         self.metadata = {**self.metadata, "render_fps": planning_task.fps}
         self.render_mode = render_mode
         self.obs_type = obs_type
-        self.camera_names = tuple(camera_names)
-        self.camera_size = (camera_height, camera_width)
+        self.camera_names = parse_camera_names(camera_name)
+        self.camera_size = (observation_height, observation_width)
 
         spec = robot_spec(robot)
         robot_model = spec.compile()
@@ -101,8 +102,8 @@ class XArmEnv(gym.Env):
             spec,
             self.camera_position,
             self.camera_target,
-            image_height=max(camera_height, RENDER_HEIGHT),
-            image_width=max(camera_width, RENDER_WIDTH),
+            image_height=max(observation_height, RENDER_HEIGHT),
+            image_width=max(observation_width, RENDER_WIDTH),
         )
         self.add_objects(spec)
         self.model = spec.compile()

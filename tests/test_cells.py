@@ -263,7 +263,7 @@ def test_an_epoch_of_the_papers_sees_each_demonstration_once():
 def test_planners_that_take_no_images_have_no_cells_of_them():
     cells = make_cells(["small", "paper"], ["xarm_sorting_images"], list(METHODS), [0])
     assert sorted({cell.policy["type"] for cell in cells}) == sorted(set(METHODS) - set(HIERARCHICAL))
-    assert {cell.dataset_root.name for cell in cells} == {"XArmSorting_obs_type_pixels_camera_names_front_200_episodes"}
+    assert {cell.dataset_root.name for cell in cells} == {"XArmSorting_obs_type_pixels_camera_name_front_200_episodes"}
 
 
 def test_cells_that_would_download_weights_are_not_packed(tmp_path):

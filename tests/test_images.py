@@ -27,10 +27,10 @@ from .conftest import TINY_PLANNER, call_command, train_in_process
 from .simulatedarm import SimulatedArm
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
-TASK = {"task": "XArmArrangeBlocks-v0", "obs_type": "pixels", "camera_names": ("front",)}
-TASK |= {"camera_height": 48, "camera_width": 64}
+TASK = {"task": "XArmArrangeBlocks-v0", "obs_type": "pixels", "camera_name": "front"}
+TASK |= {"observation_height": 48, "observation_width": 64}
 TASK_FLAGS = ("--env.type=hdp", "--env.task=XArmArrangeBlocks-v0", "--env.obs_type=pixels")
-TASK_FLAGS += ("--env.camera_names=[front]", "--env.camera_height=48", "--env.camera_width=64")
+TASK_FLAGS += ("--env.camera_name=front", "--env.observation_height=48", "--env.observation_width=64")
 TINY = {**TINY_PLANNER, "horizon": 25}
 STEPS = 3
 
@@ -106,7 +106,7 @@ def test_lerobot_rollout_executes_a_plan(runs, tmp_path):
         lerobot_rollout.main,
         *(f"--policy.path={path}", "--policy.device=cpu", "--device=cpu", "--fps=1000"),
         *("--robot.type=simulated_arm", f"--robot.env.task={TASK['task']}", "--robot.env.obs_type=pixels"),
-        *("--robot.env.camera_names=[front]", "--robot.env.camera_height=48", "--robot.env.camera_width=64"),
+        *("--robot.env.camera_name=front", "--robot.env.observation_height=48", "--robot.env.observation_width=64"),
         *(f"--robot.calibration_dir={tmp_path}", "--return_to_initial_position=false"),
     )
     arm = SimulatedArm.last
@@ -123,8 +123,8 @@ def test_another_camera_is_refused(runs, tmp_path):
         call_command(
             lerobot_eval.main,
             *(f"--policy.path={runs[1]}/checkpoints/last/pretrained_model", "--policy.device=cpu", *TASK_FLAGS[:-2]),
-            *("--env.camera_height=32", "--env.camera_width=64", "--eval.n_episodes=1", "--eval.batch_size=1"),
-            *("--eval.use_async_envs=false", f"--output_dir={tmp_path}"),
+            *("--env.observation_height=32", "--env.observation_width=64", f"--output_dir={tmp_path}"),
+            *("--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false"),
         )
 
 

@@ -41,7 +41,7 @@ def make(gym_id="hdp/XArmSorting-v0", **kwargs):
 @pytest.mark.parametrize("obs_type", OBS_TYPES)
 @pytest.mark.parametrize("gym_id", IDS)
 def test_gymnasium_finds_nothing_wrong(gym_id, obs_type):
-    env = make(gym_id, obs_type=obs_type, render_mode="rgb_array", camera_height=32, camera_width=48)
+    env = make(gym_id, obs_type=obs_type, render_mode="rgb_array", observation_height=32, observation_width=48)
     check_env(env, skip_render_check=obs_type != "state")
     observation, _ = env.reset(seed=0)
     assert ("pixels" in observation) == (obs_type != "state")
@@ -220,7 +220,7 @@ def test_a_waypoint_too_far_for_one_step_is_reported_and_reached_later():
         {"task": "XArmSorting-v0", "n_blocks": 7},
         {"task": "XArmToolUse-v0", "waypoints_per_pose": 1},
         {"task": "XArmSorting-v0", "fps": 99},
-        {"task": "BlockSorting2D-v0", "camera_width": 64},
+        {"task": "BlockSorting2D-v0", "observation_width": 64},
         {"task": "BlockSorting2D-v0", "robot": "menagerie"},
     ],
 )
@@ -249,10 +249,10 @@ def test_an_action_that_is_no_waypoint_is_refused(action):
     [
         {"obs_type": "smell"},
         {"robot": "panda"},
-        {"camera_names": ("side",)},
-        {"camera_names": ()},
-        {"camera_names": ("front", "front")},
-        {"camera_height": 0},
+        {"camera_name": "side"},
+        {"camera_name": ()},
+        {"camera_name": ("front", "front")},
+        {"observation_height": 0},
     ],
 )
 def test_an_argument_without_meaning_is_refused(kwargs):
@@ -304,7 +304,7 @@ def test_world_to_pixels_finds_the_blocks_in_the_image():
 
 
 def test_cameras_have_the_size_that_was_asked_for():
-    env = make(obs_type="pixels", camera_names=("wrist",), camera_height=500, camera_width=700)
+    env = make(obs_type="pixels", camera_name=("wrist",), observation_height=500, observation_width=700)
     observation, _ = env.reset(seed=0)
     assert {name: image.shape for name, image in observation["pixels"].items()} == {"wrist": (500, 700, 3)}
     env.close()
@@ -313,7 +313,7 @@ def test_cameras_have_the_size_that_was_asked_for():
 @pytest.mark.parametrize("obs_type", OBS_TYPES)
 @pytest.mark.parametrize("gym_id", IDS)
 def test_lerobot_sees_the_features_that_the_config_announces(gym_id, obs_type):
-    config = HDPEnv(task=gym_id.removeprefix("hdp/"), obs_type=obs_type, camera_height=32, camera_width=32)
+    config = HDPEnv(task=gym_id.removeprefix("hdp/"), obs_type=obs_type, observation_height=32, observation_width=32)
     vector_env = make_env(config, n_envs=1, use_async_envs=False)["hdp"][0]
     observation, _ = vector_env.reset(seed=[0])
     batch = preprocess_observation(observation)

@@ -19,7 +19,7 @@ ENVS: dict[str, dict[str, Any]] = {
     "xarm_sorting": {"task": "XArmSorting-v0"},
     "xarm_arrange_blocks": {"task": "XArmArrangeBlocks-v0"},
     "xarm_tool_use": {"task": "XArmToolUse-v0"},
-    "xarm_sorting_images": {"task": "XArmSorting-v0", "obs_type": "pixels", "camera_names": ["front"]},
+    "xarm_sorting_images": {"task": "XArmSorting-v0", "obs_type": "pixels", "camera_name": "front"},
     "block_sorting_2d_2_blocks": {"task": "BlockSorting2D-v0", "n_blocks": 2, "waypoints_per_pose": 1},
     "block_sorting_2d_3_blocks": {"task": "BlockSorting2D-v0", "n_blocks": 3, "waypoints_per_pose": 1},
     "block_sorting_2d_4_blocks": {"task": "BlockSorting2D-v0", "n_blocks": 4, "waypoints_per_pose": 1},
