@@ -14,19 +14,30 @@ def timed(function: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def take_turns(functions: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
-    """Seconds that each function takes in each round, after a first call that warms up."""
+def take_turns(
+    functions: dict[str, Callable[[], Any]],
+    rounds: int,
+    after_round: Callable[[dict[str, list[float]]], None] = lambda _: None,
+) -> dict[str, list[float]]:
+    """Seconds that each function takes in each round, after a first call that warms up.
+
+    Args:
+        after_round: sees what is known after each round, so that an interruption loses nothing.
+    """
     for function in functions.values():
         function()
     times: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(rounds):
         for name in random.sample(list(functions), len(functions)):
             times[name].append(timed(functions[name]))
+        after_round(times)
     return times
 
 
 def quartiles(values: Sequence[float]) -> list[float]:
-    """First quartile, median and third quartile, to four digits."""
+    """First quartile, median and third quartile, to four digits; of one value, itself."""
+    if len(values) == 1:
+        values = [*values, *values]
     return [float(f"{value:.4g}") for value in statistics.quantiles(values, n=4, method="inclusive")]
 
 

@@ -165,13 +165,16 @@ def main() -> None:
         print(f"{name}: first step {first_call_s[name]} s", flush=True)
     gc.collect()
     gc.disable()  # a collection that falls on one setting would count as its own
-    times = take_turns(functions, options.rounds)
-    milliseconds = {name: quartiles([1000 * s / options.steps for s in found]) for name, found in times.items()}
-    for name, found in milliseconds.items():
-        print(f"{name}: {found[1]} ms a step")
-    result = {**{name: value for name, value in vars(options).items() if name != "root"}, "dataset": options.root.name}
-    result |= {"first_step_s": first_call_s, "ms": milliseconds}
-    FILE.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+    facts = {**{name: value for name, value in vars(options).items() if name != "root"}, "dataset": options.root.name}
+
+    def save(times: dict[str, list[float]]) -> None:
+        rounds = len(next(iter(times.values())))
+        milliseconds = {name: quartiles([1000 * s / options.steps for s in found]) for name, found in times.items()}
+        result = {**facts, "rounds": rounds, "first_step_s": first_call_s, "ms": milliseconds}
+        FILE.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+        print(f"{rounds} of {options.rounds} rounds: " + ", ".join(f"{n} {ms[1]} ms" for n, ms in milliseconds.items()))
+
+    take_turns(functions, options.rounds, after_round=save)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 import benchmarks
-from benchmarks import conditioning, planner_report, task_pages
+from benchmarks import conditioning, planner_report, task_pages, training_step
 from benchmarks.paper.presets import METHODS, make_cells
 from benchmarks.planner_comparison import PRESETS, TASKS
 
@@ -81,6 +81,19 @@ def test_a_benchmark_runs(name, arguments, tmp_path, monkeypatch, capsys):
     [result] = tmp_path.rglob("*.json")
     assert "git_commit" in result.read_text()
     assert all(page.stat().st_size > 500 for page in tmp_path.glob("*.md"))
+
+
+def test_a_training_that_is_timed_is_known_after_each_round(dataset_root, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(training_step, "FILE", tmp_path / "steps.json")
+    size = ["--horizon=19", "--symbolic_horizon=18", "--num_layers=1", "--width=16", "--batch_size=4"]
+    chosen = ["--device=cpu", "--settings", "float32", "Muon", "--steps=1", "--rounds=2"]
+    monkeypatch.setattr("sys.argv", ["training_step", f"--root={dataset_root}", *size, *chosen])
+    training_step.main()
+    said = capsys.readouterr().out
+    assert said.index("1 of 2 rounds: float32") < said.index("2 of 2 rounds: float32")
+    result = json.loads(training_step.FILE.read_text())["result"]
+    assert result["rounds"] == 2
+    assert all(0 < low <= middle <= high for low, middle, high in result["ms"].values())
 
 
 def test_adherence_counts_the_plans_that_do_what_they_are_asked_for(tmp_path, monkeypatch):
