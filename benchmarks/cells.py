@@ -4,7 +4,6 @@ A cell's figures go to `benchmarks/results/<group>/<cell>.json`, its checkpoints
 `outputs/cells/<group>/<cell>/`. An interrupted cell goes on from its last checkpoint, whenever it was interrupted.
 """
 
-import fcntl
 import json
 import math
 import os
@@ -12,9 +11,8 @@ import shutil
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
 from multiprocessing.process import BaseProcess
@@ -24,7 +22,7 @@ from typing import Any
 import torch
 from lerobot.scripts import lerobot_train
 
-from dataset_tools.interruption import when_parent_ends
+from dataset_tools.interruption import one_process, when_parent_ends
 from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
 from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.modeling_hdp import HDPPolicy
@@ -298,12 +296,13 @@ def run_cell(cell: Cell, threads: int = 1, deadline: Deadline | None = None, tra
         One line that says how it went.
 
     Raises:
-        RuntimeError: the training or an evaluation failed; names its log. Or another process runs this cell.
+        RuntimeError: the training or an evaluation failed; names its log.
+        BlockingIOError: another process runs this cell.
         ValueError: the cell was begun with other settings.
     """
     deadline = deadline or Deadline(None)
     cell.folder.mkdir(parents=True, exist_ok=True)
-    with _lock(cell.folder / "lock"):
+    with one_process(cell.folder / "lock", f"runs this cell, {cell.folder}"):
         cell.check_begun()
         if cell.last_step < cell.steps:
             if deadline.seconds_left < SHORTEST_TRAINING_S:
@@ -453,8 +452,8 @@ def record_dataset(cell: Cell, num_workers: int) -> None:
 
 
 def _start(log: Path, threads: int, function: Callable[..., None], *arguments: Any) -> BaseProcess:
-    """Start a process that writes to a log file and ends with this one."""
-    process = PROCESSES.Process(target=_run_with_log, args=(log, threads, function, *arguments), daemon=True)
+    """Start a process that writes to a log file and ends with this one. (A daemon could have no data loader.)"""
+    process = PROCESSES.Process(target=_run_with_log, args=(log, threads, function, *arguments))
     process.start()
     return process
 
@@ -466,21 +465,6 @@ def _run_with_log(log: Path, threads: int, function: Callable[..., None], *argum
     torch.set_num_threads(threads)
     when_parent_ends(lambda: os._exit(1))
     function(*arguments)
-
-
-@contextmanager
-def _lock(path: Path) -> Iterator[None]:
-    """Hold a lock file.
-
-    Raises:
-        RuntimeError: another process holds it.
-    """
-    with path.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RuntimeError(f"another process runs this cell: {path.parent}") from error
-        yield
 
 
 def _write_json(path: Path, content: Any) -> None:

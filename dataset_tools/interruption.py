@@ -1,4 +1,4 @@
-"""What happens to a process that is told to stop, or whose parent is gone."""
+"""What happens to a process that is told to stop, whose parent is gone, or that would do what another one does."""
 
 import multiprocessing
 import os
@@ -7,6 +7,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 
 def exit_when_terminated() -> None:
@@ -32,6 +35,28 @@ def deferred_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
         for number in arrived:
             signal.raise_signal(number)
+
+
+@contextmanager
+def one_process(lock_file: Path, work: str) -> Iterator[None]:
+    """Do what only one process may do at a time; the lock is free again when that process is gone, however it ended.
+
+    Args:
+        lock_file: is made, and stays.
+        work: what is done, for the error.
+
+    Raises:
+        BlockingIOError: another process does it.
+    """
+    lock = FileLock(lock_file)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise BlockingIOError(f"another process {work}: wait for its end") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def when_parent_ends(action: Callable[[], None]) -> None:

@@ -50,7 +50,7 @@ from gym_hdp_tasks.env_config import HDPEnv
 
 from .demonstration import Expert, expert_generator
 from .experts import EXPERTS
-from .interruption import deferred_signals, end_with_parent, exit_when_terminated
+from .interruption import deferred_signals, end_with_parent, exit_when_terminated, one_process
 from .language import SYMBOLIC_PLAN, write_language_columns
 
 EPISODES_PER_SHARD = 25
@@ -126,6 +126,11 @@ class RecordConfig:
     def partial_root(self) -> Path:
         """Folder of the shards, until they are merged."""
         return self.root.with_name(self.root.name + ".partial")
+
+    @property
+    def lock_file(self) -> Path:
+        """Held by the process that records the dataset."""
+        return self.root.with_name(self.root.name + ".lock")
 
 
 class Episode(NamedTuple):
@@ -359,11 +364,20 @@ def record(config: RecordConfig) -> LeRobotDataset:
     Raises:
         FileExistsError: the dataset's folder exists, or an interrupted recording does and `resume` is not set.
         ValueError: the environment cannot be made, or the interrupted recording had other settings.
-        OSError: the upload failed.
+        OSError: another process records this dataset, or the upload failed.
     """
     if (dataset := finish_earlier_recording(config)) is not None:
         return dataset
     try_environment(config)
+    config.root.parent.mkdir(parents=True, exist_ok=True)
+    with one_process(config.lock_file, f"records {config.root}"):
+        try:
+            return _record(config)
+        finally:
+            config.lock_file.unlink()
+
+
+def _record(config: RecordConfig) -> LeRobotDataset:
     shards = plan_shards(config)
     with tqdm(total=config.dataset.num_episodes, desc="Recording", unit="episode") as progress:
         if config.num_workers == 1:

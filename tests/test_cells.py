@@ -135,7 +135,7 @@ def test_killing_the_benchmark_ends_the_training(cell, tmp_path):
         while not (log.exists() and "Training" in log.read_text()):
             assert benchmark.poll() is None
             time.sleep(0.1)
-        with pytest.raises(RuntimeError, match="another process runs this cell"):
+        with pytest.raises(BlockingIOError, match="another process runs this cell"):
             run_cell(long)
         started = psutil.Process(benchmark.pid).children(recursive=True)
         assert started

@@ -25,6 +25,7 @@ from benchmarks.paper.presets import PRESETS
 from dataset_tools import record as recorder
 from dataset_tools import record_on_cluster as cluster
 from dataset_tools.experts import EXPERTS
+from dataset_tools.interruption import one_process
 from dataset_tools.record import (
     RECORDING_PATH,
     RecordConfig,
@@ -272,6 +273,16 @@ def test_the_command_goes_on_with_an_interrupted_recording_only_when_told_to(tmp
     call_command(recorder.main, *flags, "--resume=true")
     assert load_info(config.root).total_episodes == 2
     assert not config.partial_root.exists()
+
+
+def test_a_dataset_is_recorded_by_one_process_at_a_time(tmp_path, monkeypatch):
+    config, flags = config_of(2, tmp_path / "sorting"), flags_of(2, tmp_path / "sorting")
+    monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
+    with one_process(config.lock_file, "records it"), pytest.raises(SystemExit, match="another process records .*sorting: wait"):
+        call_command(recorder.main, *flags, "--resume=true")
+    assert not config.partial_root.exists()
+    call_command(recorder.main, *flags)
+    assert [path.name for path in tmp_path.iterdir()] == ["sorting"]
 
 
 def test_an_interrupted_recording_goes_on_with_the_same_settings_only(tmp_path):
