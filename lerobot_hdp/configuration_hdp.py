@@ -78,14 +78,15 @@ PRESETS: dict[str, dict[str, Any]] = {
 class HDPConfig(PreTrainedConfig):
     """Configuration of the Hybrid Diffusion Planner.
 
-    What the planner needs to know of the data comes from the dataset: sizes, vocabulary, normalisation. Only the
-    horizon has to be said, because LeRobot asks for it before it opens the dataset.
+    What the planner needs to know of the data comes from the dataset: sizes, vocabulary, normalisation. `hdp-train`
+    looks up the horizon, too; to `lerobot-train` it has to be said, which asks for it before it opens the dataset.
 
     Attributes:
         preset: `default` (measures best) or `paper` (the paper's values). It fills the fields below that are None;
             what is set explicitly stays. A checkpoint has all of them set: there it changes nothing.
 
-        horizon: number of actions in a plan (H_c): the length of the dataset's longest episode.
+        horizon: number of actions in a plan (H_c): the length of the dataset's longest episode, for which None stands
+            with `hdp-train`.
         symbolic_horizon: number of tokens in a plan (H_d). None: that of the dataset. Longer: filled with PAD.
         n_action_steps: actions that are executed before the next plan is made, with `plan_from=any_frame`. None: the
             whole plan, open loop.
@@ -394,6 +395,15 @@ class HDPConfig(PreTrainedConfig):
         if self.observation_token_sizes is None or (self.symbol_process is not None and not symbols_known):
             raise ValueError("a planner learns its sizes and its vocabulary from a dataset: train it before use")
 
+    def set_horizon(self, horizon: int) -> None:
+        """Set a horizon that was left open, and what follows from it.
+
+        Raises:
+            ParsingError: it does not go with the other values.
+        """
+        self.horizon = horizon
+        self.__post_init__()
+
     @property
     def plans_whole_episodes(self) -> bool:
         """Whether a plan is a whole episode, from its first frame; else what is left of one, from any frame."""
@@ -419,7 +429,10 @@ class HDPConfig(PreTrainedConfig):
     @property
     def _known_horizon(self) -> int:
         if self.horizon is None:
-            raise ValueError("--policy.horizon is missing: the number of frames of the dataset's longest episode")
+            raise ValueError(
+                "--policy.horizon is missing: the number of frames of the dataset's longest episode, which hdp-train "
+                "looks up"
+            )
         return self.horizon
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:

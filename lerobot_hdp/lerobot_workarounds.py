@@ -1,4 +1,7 @@
-"""The two places where the plugin touches LeRobot itself (0.6.1), each with what would make it unnecessary."""
+"""Where a planner, or a command that loads one, changes LeRobot itself (0.6.1), with what would make it unnecessary.
+
+`hdp-train` and `hdp-record` replace functions of LeRobot, too: scripts/hdp_train.py, dataset_tools/record.py.
+"""
 
 import logging
 

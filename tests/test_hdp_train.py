@@ -6,12 +6,14 @@ import shutil
 import sys
 import warnings
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
@@ -160,19 +162,18 @@ def test_memory_needed_counts_every_tensor(camera_root):
 
 
 @pytest.fixture
-def open_datasets(monkeypatch):
+def open_datasets():
     """Open them as hdp-train does: `open_datasets(root, max_gib, policy, **config) -> datasets, num_workers`."""
-    for name in ("make_train_eval_datasets", "lerobot_collate_fn", "save_checkpoint"):
-        monkeypatch.setattr(lerobot_train, name, getattr(lerobot_train, name))
 
     def open_(root, max_gib=1.0, policy=None, rename_map=None, **kwargs):
         dataset = DatasetConfig("test/dataset", root=str(root), video_backend="pyav", **kwargs)
         config = TrainPipelineConfig(dataset, policy=policy or ACTConfig(device="cpu"), num_workers=3)
         config.rename_map = rename_map or {}
-        hdp_train.hold_datasets_in_memory(max_gib)
+        hdp_train.Replacements(max_gib).install()
         return lerobot_train.make_train_eval_datasets(config), config.num_workers
 
-    return open_
+    with mock.patch.dict(vars(lerobot_train)):
+        yield open_
 
 
 @pytest.mark.parametrize("camera_root", ["video"], indirect=True)
@@ -293,6 +294,21 @@ def test_the_planner_ends_with_the_weights_of_lerobot_train(dataset_root, lerobo
     assert_same_weights(weights(tmp_path / "run"), weights(expected_dir))
     config = tmp_path / "run/checkpoints/last/pretrained_model/train_config.json"
     assert json.loads(config.read_text())["num_workers"] == 3
+
+
+@pytest.mark.parametrize("policy_type", ["hdp", "hd"])
+def test_the_horizon_is_looked_up(dataset_root, policy_type, tmp_path):
+    size = [f"--policy.{name}={value}" for name, value in TINY_PLANNER.items() if name != "horizon"]
+    train(hdp_train.main, dataset_root, tmp_path / "run", [f"--policy.type={policy_type}", *size])
+    config = json.loads((tmp_path / "run/checkpoints/last/pretrained_model/config.json").read_text())
+    assert config["horizon"] == TINY_PLANNER["horizon"]
+    assert config.get("subgoal_interval", 4) == 4  # of 19, the square root
+
+
+def test_a_horizon_that_is_looked_up_has_to_go_with_the_rest(dataset_root, tmp_path):
+    flags = ["--policy.type=hdp", "--policy.n_action_steps=30"]
+    with pytest.raises(ParsingError, match="n_action_steps=30 is more than the plan has"):
+        train(hdp_train.main, dataset_root, tmp_path / "run", flags)
 
 
 def test_a_run_that_is_out_of_time_leaves_a_checkpoint_and_goes_on_from_it(dataset_root, lerobot_train_run, tmp_path):

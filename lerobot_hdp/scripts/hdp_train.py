@@ -1,14 +1,13 @@
 """`hdp-train`: LeRobot's own training, with the dataset in memory, for any policy and any dataset that fits.
 
 Takes all flags of `lerobot-train`, and does what it does with them, from checkpoints to `--resume` and `accelerate
-launch`: it runs LeRobot's training function. Beyond that, it normalises observations that
-`--rename_map` renames; planners of whole episodes train on episodes shorter than their plans, too, and their held-out
-loss is that of whole plans.
+launch`: it runs LeRobot's training function. Beyond that, it looks up a planner's horizon, and normalises observations
+that `--rename_map` renames; planners of whole episodes train on episodes shorter than their plans, too, and their
+held-out loss is that of whole plans.
 
-What it changes are some names in LeRobot's module, below, where LeRobot 0.6.1 has no hook: the functions that open the
-datasets, collate a batch with language columns, write a checkpoint and submit a job, for planners of whole episodes the
-sampler, and for `--max_train_minutes` those that decide about a checkpoint and do a step. A `dataset_factory`, a
-`sampler_factory` and a `should_stop` argument of `lerobot.scripts.lerobot_train.train` would make this unnecessary.
+What it replaces are some functions of LeRobot's module (`Replacements`), where LeRobot 0.6.1 has no hook, and for
+planners of whole episodes the sampler. A `dataset_factory`, a `sampler_factory` and a `should_stop` argument of
+`lerobot.scripts.lerobot_train.train` would make this unnecessary.
 
 Example:
     hdp-train --config_path=configs/xarm_sorting.json --max_train_minutes=30
@@ -26,9 +25,8 @@ import numpy as np
 import torch
 from lerobot.configs import FeatureType
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.scripts import lerobot_train
-from lerobot.utils.collate import lerobot_collate_fn
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch.distributed import ProcessGroup
 from torch.utils.data import Dataset, Subset
@@ -42,50 +40,6 @@ GIB = 2**30
 
 class OutOfTimeError(Exception):
     """Training stopped at `--max_train_minutes`, after a checkpoint."""
-
-
-def hold_datasets_in_memory(max_gib: float) -> None:
-    """Let `lerobot-train` hold its datasets in memory, if they need at most `max_gib` GiB; else it reads as always."""
-    make_datasets, save_checkpoint = lerobot_train.make_train_eval_datasets, lerobot_train.save_checkpoint
-    users_num_workers = None
-
-    def make_datasets_in_memory(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
-        nonlocal users_num_workers
-        users_num_workers = cfg.num_workers
-        train_and_eval = make_datasets(cfg)
-        opened = [dataset for dataset in train_and_eval if dataset is not None]
-        leave_out = _unused_cameras(cfg, opened[0].meta.features) if isinstance(cfg.policy, HDPConfig) else []
-        first_images_only = _plans_whole_episodes(cfg)
-        if (reason := _why_not_in_memory(opened, leave_out, first_images_only, max_gib)) is not None:
-            logging.warning("The dataset is read item by item, as by lerobot-train: %s", reason)
-            return train_and_eval
-        if all(dataset.image_transforms is None for dataset in opened):
-            cfg.num_workers = 0  # there is nothing to wait for; image transforms are made sample by sample
-        return tuple(
-            None if dataset is None else InMemoryDataset(dataset, leave_out, first_images_only)
-            for dataset in train_and_eval
-        )
-
-    def save_with_users_num_workers(*args: Any, cfg: TrainPipelineConfig, **kwargs: Any) -> None:
-        cfg.num_workers = users_num_workers  # for whoever resumes with lerobot-train
-        save_checkpoint(*args, cfg=cfg, **kwargs)
-
-    lerobot_train.make_train_eval_datasets = make_datasets_in_memory
-    lerobot_train.save_checkpoint = save_with_users_num_workers
-    lerobot_train.lerobot_collate_fn = collate_unless_collated
-
-
-def normalise_renamed_observations() -> None:
-    """Let statistics follow `--rename_map`: LeRobot renames observations before it normalises them, and not these."""
-    make_datasets = lerobot_train.make_train_eval_datasets
-
-    def make_datasets_with_renamed_stats(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
-        train, held_out = make_datasets(cfg)
-        stats = train.meta.stats or {}
-        train.meta.stats = stats | {new: dict(stats[old]) for old, new in cfg.rename_map.items() if old in stats}
-        return train, held_out
-
-    lerobot_train.make_train_eval_datasets = make_datasets_with_renamed_stats
 
 
 class FirstFrameSampler(EpisodeAwareSampler):
@@ -105,49 +59,126 @@ class FirstFrameSampler(EpisodeAwareSampler):
         super().__init__(first, first + 1, **kwargs)
 
 
-def start_where_plans_begin() -> None:
-    """Let `lerobot-train` show planners of whole episodes their first frames alone, in training and held out.
+class Replacements:
+    """What takes the place of functions of `lerobot.scripts.lerobot_train` in one training, by the names of these.
 
-    So an episode may be shorter than the horizon: LeRobot repeats its last action.
+    Args:
+        max_memory_gib: datasets that need more are read as LeRobot reads them.
+        max_train_minutes: after which there is a checkpoint, and OutOfTimeError; None: no limit.
     """
-    make_datasets = lerobot_train.make_train_eval_datasets
 
-    def make_datasets_of_first_frames(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, Dataset | None]:
-        train, held_out = make_datasets(cfg)
+    def __init__(self, max_memory_gib: float, max_train_minutes: float | None = None):
+        self.max_memory_gib = max_memory_gib
+        self.deadline = None if max_train_minutes is None else time.monotonic() + 60 * max_train_minutes
+        self.out_of_time = False
+        self.users_num_workers: int | None = None
+        self.process_group: ProcessGroup | None = None
+        self._open = lerobot_train.make_train_eval_datasets
+        self._collate = lerobot_train.lerobot_collate_fn
+        self._save = lerobot_train.save_checkpoint
+        self._should_save = lerobot_train.should_save_checkpoint
+        self._update = lerobot_train.update_policy
+
+    def install(self) -> None:
+        lerobot_train.make_train_eval_datasets = self.make_train_eval_datasets
+        lerobot_train.lerobot_collate_fn = self.lerobot_collate_fn
+        lerobot_train.save_checkpoint = self.save_checkpoint
+        lerobot_train.should_save_checkpoint = self.should_save_checkpoint
+        lerobot_train.update_policy = self.update_policy
+        lerobot_train.submit_to_hf = self.submit_to_hf
+
+    def make_train_eval_datasets(self, cfg: TrainPipelineConfig) -> tuple[Dataset, Dataset | None]:
+        """Open the datasets in memory, if they fit; for planners of whole episodes, let plans begin at first frames.
+
+        Raises:
+            ValueError: training time is limited, and no checkpoints are written.
+        """
+        if self.deadline is not None and not cfg.save_checkpoint:
+            raise ValueError("--max_train_minutes ends with a checkpoint: it needs --save_checkpoint=true")
+        if torch.distributed.is_initialized():
+            # LeRobot frees the model after the process group. The model would be the last to hold it, and end the
+            # threads of Gloo while it has the interpreter's lock, for which one of them may be waiting: the process
+            # would hang at its very end. Python's own reference frees the lock.
+            self.process_group = torch.distributed.group.WORLD
+        if isinstance(cfg.policy, HDPConfig) and cfg.policy.horizon is None:
+            cfg.policy.set_horizon(_longest_episode(cfg))
+
+        train, held_out = self._open(cfg)
+        # LeRobot renames observations before it normalises them, and not their statistics.
+        stats = train.meta.stats or {}
+        train.meta.stats = stats | {new: dict(stats[old]) for old, new in cfg.rename_map.items() if old in stats}
+
+        self.users_num_workers = cfg.num_workers
+        train, held_out = self._hold_in_memory(cfg, train, held_out)
         whole_plans = _plans_whole_episodes(cfg)
         lerobot_train.EpisodeAwareSampler = FirstFrameSampler if whole_plans else EpisodeAwareSampler
-        if held_out is None or not whole_plans:
+        return train, _first_frames(held_out) if whole_plans and held_out is not None else held_out
+
+    def _hold_in_memory(
+        self, cfg: TrainPipelineConfig, train: LeRobotDataset, held_out: LeRobotDataset | None
+    ) -> tuple[LeRobotDataset, LeRobotDataset | None]:
+        opened = [dataset for dataset in (train, held_out) if dataset is not None]
+        leave_out = _unused_cameras(cfg, train.meta.features) if isinstance(cfg.policy, HDPConfig) else []
+        options = leave_out, _plans_whole_episodes(cfg)
+        if (reason := _why_not_in_memory(opened, *options, self.max_memory_gib)) is not None:
+            logging.warning("The dataset is read item by item, as by lerobot-train: %s", reason)
             return train, held_out
-        columns = held_out.hf_dataset.with_format("numpy")
-        frames = np.flatnonzero(columns["frame_index"][:] == 0)
-        first_frames = Subset(held_out, frames.tolist())
-        # LeRobot looks here when it takes as many of each task for --max_eval_samples.
-        tasks = {"task_index": columns["task_index"][:][frames]}
-        first_frames.hf_dataset = datasets.Dataset.from_dict(tasks)  # type: ignore[attr-defined]
-        return train, first_frames
+        if all(dataset.image_transforms is None for dataset in opened):
+            cfg.num_workers = 0  # there is nothing to wait for; image transforms are made sample by sample
+        return InMemoryDataset(train, *options), None if held_out is None else InMemoryDataset(held_out, *options)
 
-    lerobot_train.make_train_eval_datasets = make_datasets_of_first_frames
+    def lerobot_collate_fn(self, samples: list[Any]) -> Any:
+        """Collate a batch with language columns, which one from memory does not need."""
+        return samples[0] if isinstance(samples[0], Batch) else self._collate(samples)
+
+    def save_checkpoint(self, *args: Any, cfg: TrainPipelineConfig, **kwargs: Any) -> None:
+        """Save the number of workers that the user said, for whoever resumes with lerobot-train."""
+        cfg.num_workers = self.users_num_workers
+        self._save(*args, cfg=cfg, **kwargs)
+
+    def should_save_checkpoint(self, step: int, save_freq: int, total_steps: int) -> bool:
+        """Also when time is over."""
+        if self.deadline is not None:
+            self.out_of_time = _on_any_process(time.monotonic() >= self.deadline) and step < total_steps
+        return self.out_of_time or self._should_save(step, save_freq, total_steps)
+
+    def update_policy(self, *args: Any, **kwargs: Any) -> Any:
+        """Do a step.
+
+        Raises:
+            OutOfTimeError: time is over.
+        """
+        if self.out_of_time:
+            raise OutOfTimeError
+        return self._update(*args, **kwargs)
+
+    def submit_to_hf(self, cfg: TrainPipelineConfig) -> None:
+        """Refuse to submit a job, which would lose what `hdp-train` adds.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(f"hdp-train trains on this machine: with --job.target={cfg.job.target}, use lerobot-train")
 
 
-def hold_process_group() -> list[ProcessGroup]:
-    """Let a distributed training's process group outlive its model, which `lerobot-train` frees after the group.
+def _longest_episode(cfg: TrainPipelineConfig) -> int:
+    """Frames of the longest episode of a dataset."""
+    source = cfg.dataset
+    meta = LeRobotDatasetMetadata(source.repo_id, root=source.root, revision=source.revision)
+    longest = max(meta.episodes["length"])
+    logging.info("The horizon is %d, the length of the longest episode", longest)
+    return longest
 
-    The model would be the last to hold the group, and end the threads of Gloo while it has the interpreter's lock, for
-    which one of them may be waiting: the process would hang at its very end. Python's own reference frees the lock.
 
-    Returns:
-        What will hold the group, until it is cleared.
-    """
-    held: list[ProcessGroup] = []
-    make_datasets = lerobot_train.make_train_eval_datasets
-
-    def make_datasets_and_hold(cfg: TrainPipelineConfig) -> Any:
-        if torch.distributed.is_initialized():
-            held.append(torch.distributed.group.WORLD)
-        return make_datasets(cfg)
-
-    lerobot_train.make_train_eval_datasets = make_datasets_and_hold
-    return held
+def _first_frames(dataset: Dataset) -> Subset:
+    """Of each episode the first frame, where whole plans begin."""
+    columns = dataset.hf_dataset.with_format("numpy")
+    frames = np.flatnonzero(columns["frame_index"][:] == 0)
+    first_frames = Subset(dataset, frames.tolist())
+    # LeRobot looks here when it takes as many of each task for --max_eval_samples.
+    tasks = {"task_index": columns["task_index"][:][frames]}
+    first_frames.hf_dataset = datasets.Dataset.from_dict(tasks)  # type: ignore[attr-defined]
+    return first_frames
 
 
 def _plans_whole_episodes(cfg: TrainPipelineConfig) -> bool:
@@ -170,51 +201,6 @@ def _why_not_in_memory(
             return reason
     needed = sum(memory_needed(dataset, leave_out, first_images_only) for dataset in opened) / GIB
     return f"it needs {needed:.1f} GiB, more than --max_memory_gib={max_gib:g}" if needed > max_gib else None
-
-
-def collate_unless_collated(samples: list[Any]) -> Any:
-    """LeRobot's collation of a batch with language columns, which one from memory does not need."""
-    return samples[0] if isinstance(samples[0], Batch) else lerobot_collate_fn(samples)
-
-
-def refuse_to_submit(cfg: TrainPipelineConfig) -> None:
-    """In place of LeRobot's submission of a job, which would lose what `hdp-train` adds.
-
-    Raises:
-        ValueError: always.
-    """
-    raise ValueError(f"hdp-train trains on this machine: with --job.target={cfg.job.target}, use lerobot-train")
-
-
-def stop_after(minutes: float) -> None:
-    """Let `lerobot-train` write a checkpoint after some minutes, then raise OutOfTimeError.
-
-    Raises:
-        ValueError: from the training, if it writes no checkpoints.
-    """
-    make_datasets = lerobot_train.make_train_eval_datasets
-    deadline = time.monotonic() + 60 * minutes
-    should_save, update_policy = lerobot_train.should_save_checkpoint, lerobot_train.update_policy
-    out_of_time = False
-
-    def make_datasets_if_saved(cfg: TrainPipelineConfig) -> Any:
-        if not cfg.save_checkpoint:
-            raise ValueError("--max_train_minutes ends with a checkpoint: it needs --save_checkpoint=true")
-        return make_datasets(cfg)
-
-    def should_save_or_stop(step: int, save_freq: int, total_steps: int) -> bool:
-        nonlocal out_of_time
-        out_of_time = _on_any_process(time.monotonic() >= deadline) and step < total_steps
-        return out_of_time or should_save(step, save_freq, total_steps)
-
-    def update_unless_out_of_time(*args: Any, **kwargs: Any) -> Any:
-        if out_of_time:
-            raise OutOfTimeError
-        return update_policy(*args, **kwargs)
-
-    lerobot_train.make_train_eval_datasets = make_datasets_if_saved
-    lerobot_train.should_save_checkpoint = should_save_or_stop
-    lerobot_train.update_policy = update_unless_out_of_time
 
 
 def _on_any_process(flag: bool) -> bool:
@@ -248,14 +234,9 @@ def main() -> None:
     options, sys.argv[1:] = parser.parse_known_args()
     if "--help" in sys.argv or "-h" in sys.argv:
         parser.print_help()
-    lerobot_train.submit_to_hf = refuse_to_submit
     keep_data_order_on_resume()
-    normalise_renamed_observations()
-    hold_datasets_in_memory(options.max_memory_gib)
-    start_where_plans_begin()
-    process_group = hold_process_group()
-    if options.max_train_minutes is not None:
-        stop_after(options.max_train_minutes)
+    replacements = Replacements(options.max_memory_gib, options.max_train_minutes)
+    replacements.install()
     try:
         lerobot_train.main()
     except OutOfTimeError:
@@ -266,7 +247,7 @@ def main() -> None:
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
     gc.collect()  # the model
-    process_group.clear()
+    replacements.process_group = None
 
 
 if __name__ == "__main__":
