@@ -208,7 +208,8 @@ class Denoiser(nn.Module):
         memory = self.condition_encoder(condition)
         hidden = self.decoder(torch.cat(plan, dim=1) + self.positions, memory)
 
-        motion_prediction = self.motion_head(hidden[:, : self.horizon])
+        with torch.autocast(hidden.device.type, enabled=False):  # bfloat16 would put waypoints on a grid
+            motion_prediction = self.motion_head(hidden[:, : self.horizon].float())
         symbol_prediction = self.symbol_head(hidden[:, self.horizon :]) if self.models_symbols else None
         return Prediction(motion_prediction, symbol_prediction)
 

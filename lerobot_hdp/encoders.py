@@ -53,8 +53,9 @@ class StateEncoder(nn.Module):
     def forward(self, batch: Mapping[str, Tensor]) -> Tensor:
         """Observations (B, n) or (B, 1, n), or (B,) where n is 1, each -> (B, num_tokens, width)."""
         state = torch.cat([batch[key].reshape(len(batch[key]), -1) for key in self.keys], dim=-1)
-        parts = state.split(self.token_sizes, dim=-1)
-        return torch.stack([project(part) for project, part in zip(self.projections, parts, strict=True)], dim=1)
+        parts = state.float().split(self.token_sizes, dim=-1)
+        with torch.autocast(state.device.type, enabled=False):  # bfloat16 would round positions
+            return torch.stack([project(part) for project, part in zip(self.projections, parts, strict=True)], dim=1)
 
 
 class ImageEncoder(nn.Module):

@@ -15,7 +15,6 @@ from lerobot.configs import NormalizationMode
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
-from lerobot.policies.utils import get_dtype_from_parameters
 from lerobot.utils.constants import ACTION
 from safetensors import SafetensorError
 from torch import Generator, Tensor, nn
@@ -33,7 +32,7 @@ from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, Masked
 from .processor_hdp import widen_narrow_ranges
 from .prompt import place_prompts
 from .sampling import Denoise, DenoisingState, sample_plan
-from .vocabulary import PAD_ID, Vocabulary
+from .vocabulary import FREE, PAD_ID, Vocabulary
 
 CONDITION = "condition_tokens"
 """Where a batch holds its encoded observations, (B, n, width), while a plan is made from it."""
@@ -135,6 +134,11 @@ class HDPPolicy(PreTrainedPolicy):
             keep_data_order_on_resume()
             if config.plans_whole_episodes:
                 _check_episodes_fit(config, dataset_meta.episodes["length"])
+            if dataset_meta.total_tasks > 1:
+                logging.warning(
+                    "The dataset has %d tasks, and the planner does not read which is asked for: tell them apart by "
+                    "symbols and a prompt, or train a planner for each.", dataset_meta.total_tasks,
+                )  # fmt: skip
         self.vocabulary = Vocabulary(config.vocabulary) if config.symbol_process else None
         self.motion_process, self.symbol_process = make_processes(config)
 
@@ -367,8 +371,8 @@ class HDPPolicy(PreTrainedPolicy):
         """What is given of each plan of a batch.
 
         It comes from the argument, else from the configuration (`--policy.prompt`), else from the environment, in
-        `observation.symbolic_plan`. In a batch of a dataset that column holds the recorded plans, in which nothing is
-        left open; they are no prompt. Where words do not say their place in the plan ("... STACK red"), the planner
+        `observation.symbolic_plan`. In a batch of a dataset that column holds the recorded plans; a plan in which
+        nothing is left open is no prompt. Where words do not say their place in the plan ("... STACK red"), the planner
         draws one, by one call of the network.
 
         Args:
@@ -381,10 +385,10 @@ class HDPPolicy(PreTrainedPolicy):
         """
         if CONDITION not in batch:
             self._check_observations(batch)
-        if prompt is None and self.config.prompt:
+        if prompt is None:
             prompt = self.config.prompt
-        if prompt is None and self.symbol_process is not None and _is_prompt(batch.get(OBS_SYMBOLIC_PLAN)):
-            prompt = PlanPrompt(token_ids=batch[OBS_SYMBOLIC_PLAN])
+        if prompt is None and self.symbol_process is not None and OBS_SYMBOLIC_PLAN in batch:
+            prompt = PlanPrompt(token_ids=_without_recorded_plans(batch[OBS_SYMBOLIC_PLAN]))
         if prompt is None:
             return PlanPrompt()
         if not isinstance(prompt, PlanPrompt):
@@ -443,14 +447,14 @@ class HDPPolicy(PreTrainedPolicy):
             self.motion_process,
             self.symbol_process,
             self._motion_shape(batch),
-            self.config.symbolic_horizon or 0,
-            self._device,
-            self.config.num_inference_steps,
-            self.config.symbol_lead,
-            self.config.shared_level,
-            prompt,
-            generator,
-            on_step,
+            symbolic_horizon=self.config.symbolic_horizon or 0,
+            device=self._device,
+            num_steps=self.config.num_inference_steps,
+            symbol_lead=self.config.symbol_lead,
+            shared_level=self.config.shared_level,
+            prompt=prompt,
+            generator=generator,
+            on_step=on_step,
         )
         return Plan(motion, tokens, probabilities, self.vocabulary, prompt.tokens_mask)
 
@@ -458,13 +462,10 @@ class HDPPolicy(PreTrainedPolicy):
         """The denoiser for the observations of a batch."""
         network = self._planning_network
         observation = batch[CONDITION] if CONDITION in batch else network.encode(batch)
-        dtype = get_dtype_from_parameters(network)
 
         def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
-            if symbols is not None and symbols.is_floating_point():
-                symbols = symbols.to(dtype)
             with self._autocast():
-                prediction = network.denoiser(motion.to(dtype), symbols, observation, k_c.to(dtype), k_d.to(dtype))
+                prediction = network.denoiser(motion, symbols, observation, k_c, k_d)
             return Prediction(*(None if part is None else part.float() for part in prediction))
 
         return denoise
@@ -615,9 +616,9 @@ def _rank_and_world_size() -> tuple[int, int]:
     return torch.distributed.get_rank(), torch.distributed.get_world_size()
 
 
-def _is_prompt(token_ids: Tensor | None) -> bool:
-    """Whether a column of plans leaves anything open; else it is what a dataset has recorded."""
-    return token_ids is not None and bool((token_ids < PAD_ID).any())
+def _without_recorded_plans(token_ids: Tensor) -> Tensor:
+    """Prompts (B, H_d), of which those that leave nothing open, as what a dataset has recorded, give nothing."""
+    return token_ids.masked_fill((token_ids >= PAD_ID).all(dim=1, keepdim=True), FREE)
 
 
 def _check_statistics(config: HDPConfig, stats: dict[str, Any]) -> None:

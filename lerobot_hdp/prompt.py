@@ -209,7 +209,7 @@ def _placements(parts: Sequence[Part], length: int) -> Iterator[tuple[int, ...]]
     """Rows of token ids, one for each way to place the parts; some may come twice."""
     says_the_end = any(part.start is not None and part.start < 0 for part in parts)
     for plan_length in range(1, length + 1) if says_the_end else (length,):
-        for starts in _starts(parts, 0, plan_length):
+        for starts in _starts(parts, plan_length):
             row = [FREE_SYMBOL if says_the_end else FREE] * plan_length + [PAD_ID] * (length - plan_length)
             for part, start in zip(parts, starts, strict=True):
                 stop = start + len(part.ids)
@@ -219,20 +219,29 @@ def _placements(parts: Sequence[Part], length: int) -> Iterator[tuple[int, ...]]
             yield tuple(row)
 
 
-def _starts(parts: Sequence[Part], earliest: int, plan_length: int) -> Iterator[tuple[int, ...]]:
+def _starts(parts: Sequence[Part], plan_length: int) -> Iterator[tuple[int, ...]]:
     """Where each part begins, without overlaps, in their order."""
-    if not parts:
+    places: list[range] = []  # for each part, as far as those after it leave room
+    end = plan_length
+    for part in reversed(parts):
+        latest = end - len(part.ids)
+        if part.start is None:
+            places.insert(0, range(latest + 1))
+        else:
+            start = part.start if part.start >= 0 else plan_length + part.start
+            if start > latest or (part.ends and part.start < 0 and start != latest):
+                return
+            places.insert(0, range(start, start + 1))
+        end = places[0].stop - 1
+    yield from _in_order(places, [len(part.ids) for part in parts], 0)
+
+
+def _in_order(places: Sequence[range], sizes: Sequence[int], earliest: int) -> Iterator[tuple[int, ...]]:
+    """One start from each of some places, from `earliest` on, so that what begins there does not overlap."""
+    if not places:
         yield ()
         return
-    part, size = parts[0], len(parts[0].ids)
-    if part.start is None:
-        choices = range(earliest, plan_length - size + 1)
-    else:
-        start = part.start if part.start >= 0 else plan_length + part.start
-        choices = range(start, start + 1)
-        if part.ends and part.start < 0 and start + size != plan_length:
-            return
-    for start in choices:
-        if earliest <= start <= plan_length - size:
-            for others in _starts(parts[1:], start + size, plan_length):
+    for start in places[0]:
+        if start >= earliest:
+            for others in _in_order(places[1:], sizes[1:], start + sizes[0]):
                 yield (start, *others)

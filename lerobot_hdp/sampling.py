@@ -82,6 +82,7 @@ def sample_plan(
     motion_process: GaussianProcess,
     symbol_process: SymbolProcess | None,
     motion_shape: tuple[int, int, int],
+    *,
     symbolic_horizon: int,
     device: torch.device,
     num_steps: int,

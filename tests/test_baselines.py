@@ -287,6 +287,7 @@ class TestContract:
             plans.append(policy.eval().plan(observation(preprocessor(batch)), generator=generator).actions)
         assert plans[1].dtype == torch.float32
         assert 0 < (plans[1] - plans[0]).norm() < 0.05 * plans[0].norm()
+        assert (plans[1].bfloat16().float() != plans[1]).float().mean() > 0.9
         inputs = preprocessor(training_batch(policy))
         with torch.autocast("cpu", torch.bfloat16):
             loss, _ = policy.train().forward(inputs)

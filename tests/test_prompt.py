@@ -109,6 +109,11 @@ def test_what_no_prompt_could_name_is_no_symbol(symbol):
         Vocabulary(["PAD", "A", symbol])
 
 
+def test_an_impossible_prompt_is_refused_without_trying_all_ways_to_place_its_beginning():
+    with pytest.raises(ValueError, match=r"no room for what begins with '3:RED'"):
+        encode_prompt("... RED ... GREEN ... BLUE ... DRAG ... STACK ... 3:RED", VOCABULARY, 108)
+
+
 def test_too_many_ways_to_place_a_prompt_are_refused():
     with pytest.raises(ValueError, match="too many ways"):
         encode_prompt("... RED ... RED ... RED ... RED ... RED ...", VOCABULARY, 40)
@@ -227,11 +232,11 @@ class TestThroughThePolicy:
     def test_a_recorded_plan_is_no_prompt_and_one_with_an_open_place_is(self, make_planner, batch):
         policy, preprocessor, _ = make_planner()
         inputs = preprocessor(batch)
-        assert policy.read_prompt(inputs).token_ids is None
+        assert not policy.read_prompt(inputs).tokens_mask.any()
         inputs["observation.symbolic_plan"][0, -1] = FREE
         given = policy.read_prompt(inputs)
-        assert torch.equal(given.token_ids, inputs["observation.symbolic_plan"])
-        assert given.tokens_mask.sum() == given.token_ids.numel() - 1
+        assert torch.equal(given.token_ids[0], inputs["observation.symbolic_plan"][0])
+        assert given.tokens_mask.sum(dim=1).tolist() == [17, 0, 0, 0]
 
     def test_an_empty_prompt_gives_nothing_whatever_the_others_say(self, make_planner, batch):
         policy, preprocessor, _ = make_planner(prompt="PICK B")
@@ -239,6 +244,8 @@ class TestThroughThePolicy:
         inputs["observation.symbolic_plan"][0, -1] = FREE
         assert policy.read_prompt(inputs).tokens_mask.sum() == 2 * 4
         assert not policy.read_prompt(inputs, "").tokens_mask.any()
+        policy.config.prompt = ""
+        assert not policy.read_prompt(inputs).tokens_mask.any()
 
     def test_a_wrong_prompt_in_the_configuration_is_refused_when_a_checkpoint_is_loaded(self, make_planner, tmp_path):
         policy, *_ = make_planner()

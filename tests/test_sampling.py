@@ -15,6 +15,8 @@ def test_a_token_has_the_probability_with_which_it_was_drawn():
 
     processes = GaussianProcess(10, "sample"), MaskedProcess(vocabulary_size=4)
     generator = torch.Generator().manual_seed(0)
-    state = sample_plan(denoise, *processes, (8, 5, 3), 6, torch.device("cpu"), num_steps=4, generator=generator)
+    state = sample_plan(
+        denoise, *processes, (8, 5, 3), symbolic_horizon=6, device=torch.device("cpu"), num_steps=4, generator=generator
+    )
     assert set(state.tokens.flatten().tolist()) == {0, 1, 2, 3}
     torch.testing.assert_close(state.token_probabilities, probabilities[state.tokens])

@@ -166,9 +166,8 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
                     return Prediction(denoise(value, level).float(), None)
 
             process, steps = self.motion_process, self.config.num_inference_steps
-            return sample_plan(
-                denoise_alone, process, None, shape, 0, device, steps, generator=generator, **kwargs
-            ).motion
+            options = {"symbolic_horizon": 0, "device": device, "num_steps": steps, "generator": generator, **kwargs}
+            return sample_plan(denoise_alone, process, None, shape, **options).motion
 
         subgoals = sample(
             lambda value, level: network.denoise_subgoals(value, state, level, None),

@@ -54,7 +54,7 @@ class GaussianProcess:
         """alpha_bar(k), with the shape and the device of the level."""
         if self._alpha_bar.device != level.device:
             self._alpha_bar = self._alpha_bar.to(level.device)
-        return self._alpha_bar.take((level * self.num_train_timesteps).round().long())
+        return self._alpha_bar[(level * self.num_train_timesteps).round().long()]
 
     def sample_level(self, batch_size: int, device: torch.device, generator: Generator | None = None) -> Tensor:
         step = torch.randint(1, self.num_train_timesteps + 1, (batch_size,), device=device, generator=generator)

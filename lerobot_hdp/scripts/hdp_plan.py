@@ -27,7 +27,7 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors, preprocess_observation
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
@@ -54,7 +54,8 @@ class PlanConfig:
         policy: the planner, by `--policy.path=` (a checkpoint's `pretrained_model` folder or a Hub repository).
         env: the task. None: the one in the checkpoint's training configuration.
         seed: seed of the start and of the plan.
-        prompt: a part of the plan in words, e.g. "PICK B ..." or "... STACK red" (docs/conditioning.md).
+        prompt: a part of the plan in words, e.g. "PICK B ..." or "... STACK red" (docs/conditioning.md). None: what the
+            policy's configuration or the environment asks for; "" is nothing.
         check: prefer, among `--policy.num_candidates` plans, those without complaints by the task's checker.
         output_dir: where the pictures go.
         html: file for a page with the plan, its execution and its denoising, to open in a browser. None: no page.
@@ -65,7 +66,7 @@ class PlanConfig:
     policy: PreTrainedConfig | None = None
     env: EnvConfig | None = None
     seed: int = 0
-    prompt: str = ""
+    prompt: str | None = None
     check: bool = False
     output_dir: Path = Path("outputs/plan")
     html: Path | None = None
@@ -79,7 +80,8 @@ class PlanConfig:
         overrides = parser.get_cli_overrides("policy") or []
         self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         self.policy.pretrained_path = Path(path)
-        if trained := _train_config(path, self.policy.pretrained_revision):
+        missing = self.env is None or (self.explain is not None and self.dataset is None)
+        if missing and (trained := _train_config(path, self.policy.pretrained_revision)):
             self.env = self.env or trained.env
             self.dataset = self.dataset or trained.dataset
         if self.explain is None and self.env is None:
@@ -177,7 +179,7 @@ def make_plan(config: PlanConfig) -> Result:
             return task.check_plan(symbols, raw)
 
         recorder = Recorder(env, policy, unnormalise)
-        plan = policy.plan(batch, config.prompt or None, on_step=recorder, check=check if config.check else None)
+        plan = policy.plan(batch, config.prompt, on_step=recorder, check=check if config.check else None)
         start, states = env.call("render")[0], recorder.page_states(plan)
         given = [False] * len(states[-1].words)
         if plan.tokens_given is not None:
@@ -191,7 +193,7 @@ def make_plan(config: PlanConfig) -> Result:
         if config.html is not None:
             probabilities = plan.token_probabilities[0, : len(given)].tolist()
             about = [outcome, f"seed {config.seed}", *(complaints or [])]
-            if prompt := config.prompt or policy.config.prompt:
+            if prompt := policy.config.prompt if config.prompt is None else config.prompt:
                 about.insert(0, f"prompt: {prompt}")
             write_page(PlanPage(about, start, frames, states, probabilities, given, step_ends), config.html)
             files["page"] = config.html
@@ -215,8 +217,9 @@ def explain(config: PlanConfig) -> str:
     if source is None:
         raise ValueError("the checkpoint names no dataset: choose one with --dataset.repo_id=... --dataset.root=...")
     try:
-        windows = resolve_delta_timestamps(policy.config, LeRobotDatasetMetadata(source.repo_id, root=source.root))
-        dataset = LeRobotDataset(source.repo_id, root=source.root, delta_timestamps=windows, video_backend="pyav")
+        where = {"root": source.root, "revision": source.revision}
+        windows = resolve_delta_timestamps(policy.config, LeRobotDatasetMetadata(source.repo_id, **where))
+        dataset = LeRobotDataset(source.repo_id, delta_timestamps=windows, video_backend="pyav", **where)
     except (OSError, HTTPError) as error:
         raise ValueError(f"the dataset {source.repo_id} is not in {source.root}, nor to be had: {error}") from error
     features = dataset_to_policy_features(dataset.meta.features)
@@ -232,8 +235,9 @@ def explain(config: PlanConfig) -> str:
     if stop - first > policy.config.horizon:
         raise ValueError(f"the episode has {stop - first} frames, the planner's horizon is {policy.config.horizon}")
     item = dataset[first]
-    batch = preprocessor({key: item[key][None] for key in (*policy.config.input_features, "action")})
-    plan = policy.plan(batch, PlanPrompt(actions=batch["action"]))
+    batch = preprocessor({key: item[key][None] for key in (*policy.config.input_features, ACTION)})
+    actions = batch[ACTION].reshape(1, policy.config.horizon, -1)  # LeRobot's are (B, H) where there is one component
+    plan = policy.plan(batch, PlanPrompt(actions=actions))
     task = getattr(config.env, "planning_task", None)
     words = plan.describe(0, task.step_ends if task else None)
     return f"episode {config.explain}:\n{indent(words, '    ')}\n{_compare(plan.symbols(), dataset, item)}"
