@@ -278,7 +278,10 @@ def test_the_command_goes_on_with_an_interrupted_recording_only_when_told_to(tmp
 def test_a_dataset_is_recorded_by_one_process_at_a_time(tmp_path, monkeypatch):
     config, flags = config_of(2, tmp_path / "sorting"), flags_of(2, tmp_path / "sorting")
     monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
-    with one_process(config.lock_file, "records it"), pytest.raises(SystemExit, match="another process records .*sorting: wait"):
+    with (
+        one_process(config.lock_file, "records it"),
+        pytest.raises(SystemExit, match=r"another process records .*: wait"),
+    ):
         call_command(recorder.main, *flags, "--resume=true")
     assert not config.partial_root.exists()
     call_command(recorder.main, *flags)
