@@ -128,6 +128,11 @@ TODAYS = {
     "type=separate_diffuser": Variant("small", {"type": "separate_diffuser", "symbol_loss_weight": 0.1}),
     "steps=2x": Variant("small", steps=2),
     "demonstrations=4x": Variant("small", demonstrations=4),
+    "optimizer_weight_decay=0.3": Variant("small", {"optimizer_weight_decay": 0.3}),
+    "observation_noise=0.02": Variant("small", {"observation_noise": 0.02}),
+    "observation_noise=0.02, optimizer_weight_decay=0.3": Variant(
+        "small", {"observation_noise": 0.02, "optimizer_weight_decay": 0.3}
+    ),
     "separate_diffuser": Variant("small", method="separate_diffuser"),
     "separate_diffuser, demonstrations=4x": Variant("small", method="separate_diffuser", demonstrations=4),
 }

@@ -120,6 +120,11 @@ class HDPConfig(PreTrainedConfig):
             the symbols lead (`symbol_lead`). There the planner decides which of several plans it makes, with nothing to
             go by but the observation; independent levels show it next to no such samples. Used with 4,000
             demonstrations; with few, the planner may learn by heart which plan belongs to which start.
+        observation_noise: standard deviation, in metres or what else they are in, of noise that training adds to the
+            poses in `observation.environment_state` beside a motion of pure noise, and less the clearer the motion is
+            (conditioning augmentation: Ho et al. 2022, "Cascaded Diffusion Models"). Where the plan is decided, starts
+            then look alike that differ by less, so that the planner cannot learn by heart which of a few
+            demonstrations belongs to which; where the motion takes shape, it sees the poses as they are.
         ema_power, ema_max_decay: the weights that plan are an exponential moving average with the decay
             min(1 - (1 + update)^-ema_power, ema_max_decay), as in Diffusion Policy. `ema_max_decay` 0 switches it off.
 
@@ -190,6 +195,7 @@ class HDPConfig(PreTrainedConfig):
     symbol_loss_weight: float | None = None
     mask_schedule: str = "linear"
     lead_share: float = 0.0
+    observation_noise: float = 0.0
     ema_power: float = 0.75
     ema_max_decay: float = 0.9999
 
@@ -259,6 +265,12 @@ class HDPConfig(PreTrainedConfig):
             raise ParsingError(f"symbol_lead must be at least 0 and less than 1, got {self.symbol_lead}")
         if self.lead_share and (self.symbol_process is None or self.shared_level):
             raise ParsingError("lead_share is about symbols with a level of their own, which this planner has not")
+        if self.observation_noise < 0:
+            raise ParsingError(f"observation_noise must be at least 0, got {self.observation_noise}")
+        if self.observation_noise and "ENV" in self.planned_modalities:
+            raise ParsingError(f"observation_noise is not for planners of type {self.type}, whose plans are poses")
+        if self.observation_noise and self.normalization_mapping.get("ENV") is not NormalizationMode.MIN_MAX:
+            raise ParsingError("observation_noise knows the units of poses with normalization_mapping ENV: MIN_MAX")
         if self.resize_shape is not None and min(self.resize_shape) < 1:
             raise ParsingError(f"resize_shape is a height and a width of at least 1, got {self.resize_shape}")
         if self.width % self.num_heads or self.width % 2 or self.width < NARROWEST_WIDTH:
@@ -383,6 +395,8 @@ class HDPConfig(PreTrainedConfig):
             raise ValueError("the planner has nothing to observe: the dataset has no column that it can take")
         if self.action_feature is None:
             raise ValueError("the dataset has no column 'action'")
+        if self.observation_noise and OBS_ENV_STATE not in self.input_features:
+            raise ValueError(f"observation_noise is added to {OBS_ENV_STATE}, which is not observed")
         for key, feature in self.image_features.items():
             height, width = self.resize_shape or feature.shape[1:]
             if min(height, width) <= BACKBONE_STRIDE:

@@ -15,7 +15,7 @@ from lerobot.configs import NormalizationMode
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE
 from safetensors import SafetensorError
 from torch import Generator, Tensor, nn
 
@@ -29,11 +29,14 @@ from .moving_average import MovingAverage
 from .optimizer import parameter_groups
 from .plan import Plan, PlanCheck, PlanPrompt
 from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess, Process, SymbolProcess
+from .processes.base import expand_to
 from .processor_hdp import widen_narrow_ranges
 from .prompt import place_prompts
 from .sampling import Denoise, DenoisingState, sample_plan
 from .vocabulary import FREE, PAD_ID, Vocabulary
 
+POSE_NOISE_POWER = 3
+"""Of the share of noise in the motion's variance: how fast `observation_noise` falls as the motion becomes clear."""
 CONDITION = "condition_tokens"
 """Where a batch holds its encoded observations, (B, n, width), while a plan is made from it."""
 
@@ -156,6 +159,9 @@ class HDPPolicy(PreTrainedPolicy):
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
         self.register_buffer("forward_calls", torch.tensor(0))
         self._seed_and_calls: tuple[int, int] | None = None
+        self.pose_noise: Tensor
+        noise = _pose_noise(config, dataset_stats) if config.observation_noise and dataset_stats else torch.zeros(())
+        self.register_buffer("pose_noise", noise, persistent=False)
         self.register_load_state_dict_pre_hook(self._start_or_end_average)
         self.reset()
 
@@ -241,7 +247,8 @@ class HDPPolicy(PreTrainedPolicy):
         levels = self._sample_levels(self.motion_process, len(motion), generator)
         levels = levels.masked_fill(self._symbols_lead(levels, generator), 1.0)
         noisy_motion = self._corrupt(self.motion_process, motion, levels, generator)
-        observation, k_c = network.encode(batch), noisy_motion.level
+        k_c = noisy_motion.level
+        observation = network.encode(self._with_pose_noise(batch, k_c, generator))
         if self.symbol_process is None:
             prediction = network.denoiser(noisy_motion.value, None, observation, k_c, torch.zeros_like(k_c))
             loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
@@ -261,6 +268,19 @@ class HDPPolicy(PreTrainedPolicy):
     def _motion(self, batch: dict[str, Tensor]) -> Tensor:
         """The actions, (B, H, D); LeRobot's are (B, H) where D is 1."""
         return batch[ACTION].reshape(len(batch[ACTION]), -1, *self.config.action_feature.shape)
+
+    def _with_pose_noise(
+        self, batch: dict[str, Tensor], level: Tensor, generator: Generator | None
+    ) -> dict[str, Tensor]:
+        """A batch whose poses are, in training, the less known the noisier the motion is; see `observation_noise`."""
+        if not (self.training and self.config.observation_noise):
+            return batch
+        rank, world_size = _rank_and_world_size()
+        poses = batch[OBS_ENV_STATE]
+        shape = (world_size, *poses.shape)
+        noise = torch.randn(shape, device=poses.device, dtype=poses.dtype, generator=generator)[rank]
+        strength = (1 - self.motion_process.alpha_bar(level)) ** POSE_NOISE_POWER
+        return {**batch, OBS_ENV_STATE: poses + expand_to(strength, poses) * self.pose_noise * noise}
 
     def _symbols_lead(self, levels: Tensor, generator: Generator | None) -> Tensor:
         """In which samples the motion is pure noise, as in planning while the symbols lead: like levels, bool."""
@@ -619,6 +639,14 @@ def _rank_and_world_size() -> tuple[int, int]:
 def _without_recorded_plans(token_ids: Tensor) -> Tensor:
     """Prompts (B, H_d), of which those that leave nothing open, as what a dataset has recorded, give nothing."""
     return token_ids.masked_fill((token_ids >= PAD_ID).all(dim=1, keepdim=True), FREE)
+
+
+def _pose_noise(config: HDPConfig, stats: dict[str, Any]) -> Tensor:
+    """`observation_noise` of each component of the poses, normalised as these are: (n,)."""
+    ranges = {OBS_ENV_STATE: dict(stats[OBS_ENV_STATE])}
+    widen_narrow_ranges(config, ranges)
+    low, high = (torch.as_tensor(ranges[OBS_ENV_STATE][bound]) for bound in ("min", "max"))
+    return (config.observation_noise * 2 / (high - low)).float()
 
 
 def _check_statistics(config: HDPConfig, stats: dict[str, Any]) -> None:

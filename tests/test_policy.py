@@ -8,6 +8,7 @@ import torch
 from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE
 from torch.utils.data import default_collate
 
 from lerobot_hdp import FREE, HDPConfig, PlanPrompt
@@ -412,6 +413,39 @@ def test_a_policy_goes_on_from_the_state_that_it_loads(make_planner, batch):
         torch.nn.init.ones_(next(policy.planner.parameters()))
         policy.update()
     assert all(torch.equal(value, ahead.state_dict()[name]) for name, value in behind.state_dict().items())
+
+
+def test_training_hides_where_the_objects_are_while_the_motion_does_too(make_planner, training_batch, dataset):
+    """The noise of poses has the size that was asked for, in metres, and is none in evaluation."""
+    policy, preprocessor, _ = make_planner(observation_noise=0.02)
+    inputs, seen = preprocessor(training_batch(policy)), []
+    policy.planner.encoder.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    stats = dataset.meta.stats[OBS_ENV_STATE]
+    half_range = torch.tensor(stats["max"] - stats["min"]) / 2
+    for level, expected in ((1.0, 0.02), (0.1, 0.0)):
+        policy.motion_process.sample_level = lambda size, device, generator, level=level: torch.full((size,), level)
+        seen.clear()
+        for _ in range(100):
+            policy.train().forward(inputs)
+        shift = torch.stack([batch[OBS_ENV_STATE] - inputs[OBS_ENV_STATE] for batch in seen]) * half_range
+        assert shift.std(dim=(0, 1)).tolist() == pytest.approx([expected] * 4, rel=0.2, abs=1e-4)
+        assert all(torch.equal(batch["observation.state"], inputs["observation.state"]) for batch in seen)
+    policy.ema.module.encoder.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    policy.eval().forward(inputs)
+    assert torch.equal(seen[-1][OBS_ENV_STATE], inputs[OBS_ENV_STATE])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"observation_noise": -1.0}, "must be at least 0"),
+        ({"policy_type": "hd", "observation_noise": 0.02}, "not for planners of type hd"),
+        ({"observation_noise": 0.02, "normalization_mapping": {"ACTION": NormalizationMode.MIN_MAX}}, "ENV: MIN_MAX"),
+    ],
+)
+def test_noise_of_poses_that_cannot_be_is_refused(make_planner, options, message):
+    with pytest.raises(ParsingError, match=message):
+        make_planner(**options)
 
 
 def test_a_cpu_without_bfloat16_computes_in_float32_with_a_warning(monkeypatch):
