@@ -159,8 +159,8 @@ class HDPPolicy(PreTrainedPolicy):
         self.register_buffer("noise_seed", torch.randint(2**31, ()))
         self.register_buffer("forward_calls", torch.tensor(0))
         self._seed_and_calls: tuple[int, int] | None = None
-        self.pose_noise: Tensor
-        noise = _pose_noise(config, dataset_stats) if config.observation_noise and dataset_stats else torch.zeros(())
+        self.pose_noise: Tensor | None
+        noise = _pose_noise(config, dataset_stats) if config.observation_noise and dataset_stats else None
         self.register_buffer("pose_noise", noise, persistent=False)
         self.register_load_state_dict_pre_hook(self._start_or_end_average)
         self.reset()
@@ -275,6 +275,8 @@ class HDPPolicy(PreTrainedPolicy):
         """A batch whose poses are, in training, the less known the noisier the motion is; see `observation_noise`."""
         if not (self.training and self.config.observation_noise):
             return batch
+        if self.pose_noise is None:
+            raise ValueError("observation_noise has the units of the poses: make the policy with dataset_stats")
         rank, world_size = _rank_and_world_size()
         poses = batch[OBS_ENV_STATE]
         shape = (world_size, *poses.shape)
