@@ -452,7 +452,10 @@ def record_dataset(cell: Cell, num_workers: int) -> None:
 
 
 def _start(log: Path, threads: int, function: Callable[..., None], *arguments: Any) -> BaseProcess:
-    """Start a process that writes to a log file and ends with this one. (A daemon could have no data loader.)"""
+    """Start a process that writes to a log file and ends with this one.
+
+    It is no daemon, which could have no children, such as a data loader's workers.
+    """
     process = PROCESSES.Process(target=_run_with_log, args=(log, threads, function, *arguments))
     process.start()
     return process

@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -42,7 +42,7 @@ def one_process(lock_file: Path, work: str) -> Iterator[None]:
     """Do what only one process may do at a time; the lock is free again when that process is gone, however it ended.
 
     Args:
-        lock_file: is made, and stays.
+        lock_file: is there meanwhile.
         work: what is done, for the error.
 
     Raises:
@@ -56,6 +56,8 @@ def one_process(lock_file: Path, work: str) -> Iterator[None]:
     try:
         yield
     finally:
+        with suppress(OSError):  # Windows removes it at its release
+            lock_file.unlink()
         lock.release()
 
 

@@ -371,10 +371,7 @@ def record(config: RecordConfig) -> LeRobotDataset:
     try_environment(config)
     config.root.parent.mkdir(parents=True, exist_ok=True)
     with one_process(config.lock_file, f"records {config.root}"):
-        try:
-            return _record(config)
-        finally:
-            config.lock_file.unlink()
+        return _record(config)
 
 
 def _record(config: RecordConfig) -> LeRobotDataset:
