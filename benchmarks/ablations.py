@@ -202,11 +202,11 @@ The planners of [`small`](results.md), and what one change makes of them. (`lead
 `steps=2x` is trained twice as long. With 200 demonstrations of four blocks, that makes HDP's motions more precise, and
 its symbols learn the demonstrations by heart: valid plans fall from 93 of 100 in the middle to 68 in the end.)
 
-What helps is more demonstrations; or, with the same ones, `observation_noise`, by which starts look alike that differ by
-less than about two centimetres while the plan is decided. At the end of the training, 93 of 100 plans are valid with
-it, with more weight decay, too, 98, with that alone 87, and without either 81 to 89 (three seeds). It has been tried in
-this task alone, with one seed, at one size, and for no other planner, so that no preset has it. (These three were
-trained in float32, the others in bfloat16, which made waypoints and poses coarser than it does now.)
+What helps is more demonstrations; or, with the same ones, `observation_noise`, by which starts look alike that differ
+by less than about two centimetres while the plan is decided. At the end of the training, 93 of 100 plans are valid
+with it, with more weight decay, too, 98, with that alone 87, and without either 81 to 89 (three seeds). It has been
+tried in this task alone, with one seed, at one size, and for no other planner, so that no preset has it. (These three
+were trained in float32, the others in bfloat16, which made waypoints and poses coarser than it does now.)
 
 """
 ABOUT_DIFFUSER = """
