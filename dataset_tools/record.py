@@ -369,7 +369,10 @@ def record(config: RecordConfig) -> LeRobotDataset:
     if (dataset := finish_earlier_recording(config)) is not None:
         return dataset
     try_environment(config)
-    config.root.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        config.root.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise NotADirectoryError(f"Not a directory: {config.root.parent}; choose another --dataset.root") from error
     with one_process(config.lock_file, f"records {config.root}"):
         return _record(config)
 

@@ -6,6 +6,7 @@ import pkgutil
 import shutil
 
 import pytest
+from accelerate.state import AcceleratorState
 
 import benchmarks
 from benchmarks import conditioning, planner_report, task_pages, training_step
@@ -88,7 +89,11 @@ def test_a_training_that_is_timed_is_known_after_each_round(dataset_root, tmp_pa
     size = ["--horizon=19", "--symbolic_horizon=18", "--num_layers=1", "--width=16", "--batch_size=4"]
     chosen = ["--device=cpu", "--settings", "float32", "Muon", "--steps=1", "--rounds=2"]
     monkeypatch.setattr("sys.argv", ["training_step", f"--root={dataset_root}", *size, *chosen])
-    training_step.main()
+    AcceleratorState._reset_state(reset_partial_state=True)  # the benchmark has bfloat16 in it, other tests have not
+    try:
+        training_step.main()
+    finally:
+        AcceleratorState._reset_state(reset_partial_state=True)
     said = capsys.readouterr().out
     assert said.index("1 of 2 rounds: float32") < said.index("2 of 2 rounds: float32")
     result = json.loads(training_step.FILE.read_text())["result"]
