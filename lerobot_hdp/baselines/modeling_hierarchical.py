@@ -166,8 +166,17 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
                     return Prediction(denoise(value, level).float(), None)
 
             process, steps = self.motion_process, self.config.num_inference_steps
-            options = {"symbolic_horizon": 0, "device": device, "num_steps": steps, "generator": generator, **kwargs}
-            return sample_plan(denoise_alone, process, None, shape, **options).motion
+            return sample_plan(
+                denoise_alone,
+                process,
+                None,
+                shape,
+                symbolic_horizon=0,
+                device=device,
+                num_steps=steps,
+                generator=generator,
+                **kwargs,
+            ).motion
 
         subgoals = sample(
             lambda value, level: network.denoise_subgoals(value, state, level, None),
