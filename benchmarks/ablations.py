@@ -135,12 +135,14 @@ TODAYS = {
     ),
     "separate_diffuser": Variant("small", method="separate_diffuser"),
     "separate_diffuser, demonstrations=4x": Variant("small", method="separate_diffuser", demonstrations=4),
+    "separate_diffuser, observation_noise=0.02": Variant("small", {"observation_noise": 0.02}, "separate_diffuser"),
 }
 OF_DIFFUSER = {
     "diffuser": Variant("small", method="diffuser"),
     "diffuser, optimizer_lr=1e-3": Variant("small", {"optimizer_lr": 1e-3}, "diffuser"),
     "diffuser, steps=2x": Variant("small", method="diffuser", steps=2),
     "diffuser, demonstrations=4x": Variant("small", method="diffuser", demonstrations=4),
+    "diffuser, observation_noise=0.02": Variant("small", {"observation_noise": 0.02}, "diffuser"),
 }
 OF_LARGE_DIFFUSER = {
     "large diffuser": Variant("default", method="diffuser"),
