@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial, wraps
 from typing import Any, NoReturn
 
-import numpy as np
 import torch
 from huggingface_hub import ModelCard
 from lerobot.configs import NormalizationMode
@@ -28,11 +27,12 @@ from .model_card import describe_planner
 from .moving_average import MovingAverage
 from .optimizer import parameter_groups
 from .plan import Plan, PlanCheck, PlanPrompt
-from .processes import Corrupted, GaussianProcess, GaussianSymbolProcess, MaskedProcess, Process, SymbolProcess
+from .processes import GaussianProcess, GaussianSymbolProcess, MaskedProcess, SymbolProcess
 from .processes.base import expand_to
 from .processor_hdp import widen_narrow_ranges
 from .prompt import place_prompts
 from .sampling import Denoise, DenoisingState, sample_plan
+from .training_noise import TrainingNoise, mix_seeds
 from .vocabulary import FREE, PAD_ID, Vocabulary
 
 POSE_NOISE_POWER = 3
@@ -202,17 +202,17 @@ class HDPPolicy(PreTrainedPolicy):
                     stacklevel=2,
                 )
             # The same noise at every evaluation, so that their losses differ by the weights.
-            return self._loss(batch, self._planning_network, Generator(self._device).manual_seed(0))
+            return self._loss(batch, self._planning_network, TrainingNoise.seeded(self._device, 0))
         if self._seed_and_calls is None and self._has_partial_plans(batch):
             raise ValueError(
                 "there are samples from the middle of episodes, as with --dataset.streaming=true; a planner of whole "
                 "episodes needs --dataset.streaming=false, or --policy.plan_from=any_frame"
             )
         step = self._next_step()
-        generator = Generator(self._device).manual_seed(_seed(*step))
+        noise = TrainingNoise.seeded(self._device, *step)
         with torch.random.fork_rng(devices=self._cuda_devices):
-            torch.manual_seed(_seed(*step, 1 + _rank_and_world_size()[0]))  # of dropout
-            return self._loss(batch, self.planner, generator)
+            torch.manual_seed(mix_seeds(*step, 1 + noise.rank))  # of dropout
+            return self._loss(batch, self.planner, noise)
 
     def _has_partial_plans(self, batch: dict[str, Tensor]) -> bool:
         """Whether a planner of whole episodes is shown samples from the middle of some.
@@ -241,25 +241,22 @@ class HDPPolicy(PreTrainedPolicy):
         self._seed_and_calls = None
 
     def _loss(
-        self, batch: dict[str, Tensor], network: Planner, generator: Generator | None
+        self, batch: dict[str, Tensor], network: Planner, noise: TrainingNoise
     ) -> tuple[Tensor, dict[str, float]]:
         motion = self._motion(batch)
-        levels = self._sample_levels(self.motion_process, len(motion), generator)
-        levels = levels.masked_fill(self._symbols_lead(levels, generator), 1.0)
-        noisy_motion = self._corrupt(self.motion_process, motion, levels, generator)
-        k_c = noisy_motion.level
-        observation = network.encode(self._with_pose_noise(batch, k_c, generator))
+        k_c = noise.level(self.motion_process, len(motion))
+        if self.config.lead_share > 0:  # pure noise, as in planning while the symbols lead
+            k_c = k_c.masked_fill(noise.choose(self.config.lead_share, len(motion)), 1.0)
+        noisy_motion = noise.corrupt(self.motion_process, motion, k_c)
+        observation = network.encode(self._with_pose_noise(batch, k_c, noise))
         if self.symbol_process is None:
             prediction = network.denoiser(noisy_motion.value, None, observation, k_c, torch.zeros_like(k_c))
             loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
             return loss, read_losses(motion_loss=loss)
 
-        if not self.config.shared_level:
-            levels = self._sample_levels(self.symbol_process, len(motion), generator)
-        corrupted_symbols = self._corrupt(self.symbol_process, batch[OBS_SYMBOLIC_PLAN], levels, generator)
-        prediction = network.denoiser(
-            noisy_motion.value, corrupted_symbols.value, observation, k_c, corrupted_symbols.level
-        )
+        k_d = k_c if self.config.shared_level else noise.level(self.symbol_process, len(motion))
+        corrupted_symbols = noise.corrupt(self.symbol_process, batch[OBS_SYMBOLIC_PLAN], k_d)
+        prediction = network.denoiser(noisy_motion.value, corrupted_symbols.value, observation, k_c, k_d)
         motion_loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
         symbol_loss = self.symbol_process.loss(prediction.symbols, corrupted_symbols).mean()
         loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
@@ -269,42 +266,16 @@ class HDPPolicy(PreTrainedPolicy):
         """The actions, (B, H, D); LeRobot's are (B, H) where D is 1."""
         return batch[ACTION].reshape(len(batch[ACTION]), -1, *self.config.action_feature.shape)
 
-    def _with_pose_noise(
-        self, batch: dict[str, Tensor], level: Tensor, generator: Generator | None
-    ) -> dict[str, Tensor]:
+    def _with_pose_noise(self, batch: dict[str, Tensor], k_c: Tensor, noise: TrainingNoise) -> dict[str, Tensor]:
         """A batch whose poses are, in training, the less known the noisier the motion is; see `observation_noise`."""
         if not (self.training and self.config.observation_noise):
             return batch
         if self.pose_noise is None:
             raise ValueError("observation_noise has the units of the poses: make the policy with dataset_stats")
-        rank, world_size = _rank_and_world_size()
         poses = batch[OBS_ENV_STATE]
-        shape = (world_size, *poses.shape)
-        noise = torch.randn(shape, device=poses.device, dtype=poses.dtype, generator=generator)[rank]
-        strength = (1 - self.motion_process.alpha_bar(level)) ** POSE_NOISE_POWER
-        return {**batch, OBS_ENV_STATE: poses + expand_to(strength, poses) * self.pose_noise * noise}
-
-    def _symbols_lead(self, levels: Tensor, generator: Generator | None) -> Tensor:
-        """In which samples the motion is pure noise, as in planning while the symbols lead: like levels, bool."""
-        if self.config.lead_share == 0:
-            return torch.zeros_like(levels, dtype=torch.bool)
-        return torch.rand(len(levels), device=levels.device, generator=generator) < self.config.lead_share
-
-    def _sample_levels(self, process: Process, batch_size: int, generator: Generator | None) -> Tensor:
-        """Levels for the batches of all processes of a distributed run, (processes x B,); see `_corrupt`."""
-        return process.sample_level(_rank_and_world_size()[1] * batch_size, self._device, generator)
-
-    def _corrupt(self, process: Process, clean: Tensor, levels: Tensor, generator: Generator | None) -> Corrupted:
-        """Corrupt this process' batch, as one process would corrupt it as a part of the batches of all of them.
-
-        So a run on n devices has the noise of a run on one device with n times the batch size.
-        """
-        rank, world_size = _rank_and_world_size()
-        if world_size == 1:
-            return process.corrupt(clean, levels, generator)
-        corrupted = process.corrupt(clean.repeat(world_size, *[1] * (clean.ndim - 1)), levels, generator)
-        own = slice(rank * len(clean), (rank + 1) * len(clean))
-        return Corrupted(corrupted.value[own], corrupted.target[own], corrupted.level[own])
+        strength = (1 - self.motion_process.alpha_bar(k_c)) ** POSE_NOISE_POWER
+        blurred = poses + expand_to(strength, poses) * self.pose_noise * noise.normal(poses)
+        return {**batch, OBS_ENV_STATE: blurred}
 
     @torch.no_grad()
     @_without_dropout
@@ -618,24 +589,12 @@ def read_losses(**losses: Tensor) -> dict[str, float]:
     return dict(zip(losses, torch.stack(list(losses.values())).tolist(), strict=True))
 
 
-def _seed(*numbers: int) -> int:
-    """A seed that follows from some numbers."""
-    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
-
-
 def _one_text_each(prompt: str | Sequence[str], batch_size: int) -> list[str]:
     """A prompt in words for each observation."""
     texts = [prompt] * batch_size if isinstance(prompt, str) else list(prompt)
     if len(texts) != batch_size:
         raise ValueError(f"there are {len(texts)} prompts for {batch_size} observations")
     return texts
-
-
-def _rank_and_world_size() -> tuple[int, int]:
-    """Number of this process, and how many there are in a distributed run."""
-    if not torch.distributed.is_initialized():
-        return 0, 1
-    return torch.distributed.get_rank(), torch.distributed.get_world_size()
 
 
 def _without_recorded_plans(token_ids: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from ..encoders import StateEncoder
 from ..modeling_hdp import HDPPolicy, read_losses
 from ..plan import Plan, PlanPrompt
 from ..sampling import DenoisingState, Stream, sample_plan
+from ..training_noise import TrainingNoise
 from .configuration_hierarchical import CoupledHierarchicalDiffuserConfig, HierarchicalDiffuserConfig
 
 
@@ -128,22 +129,18 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
         return PlanPrompt(actions=self._to_segments(actions), actions_given=self._to_segments(given)[..., 0])
 
     def _loss(
-        self, batch: dict[str, Tensor], network: HierarchicalPlanner, generator: Generator | None
+        self, batch: dict[str, Tensor], network: HierarchicalPlanner, noise: TrainingNoise
     ) -> tuple[Tensor, dict[str, float]]:
         """Each level's squared error; the low level is trained on the demonstration's own sub-goals."""
         process = self.motion_process
         states, segments = self._states(batch), self._to_segments(self._motion(batch))
         state, subgoals = states[:, 0], states[:, 1:]
 
-        noisy_subgoals = self._corrupt(
-            process, subgoals, self._sample_levels(process, len(subgoals), generator), generator
-        )
+        noisy_subgoals = noise.corrupt(process, subgoals, noise.level(process, len(subgoals)))
         prediction = network.denoise_subgoals(noisy_subgoals.value, state, noisy_subgoals.level, None)
         subgoal_loss = process.loss(prediction, noisy_subgoals).mean()
 
-        noisy_segments = self._corrupt(
-            process, segments, self._sample_levels(process, len(segments), generator), generator
-        )
+        noisy_segments = noise.corrupt(process, segments, noise.level(process, len(segments)))
         prediction = network.denoise_segments(noisy_segments.value, state, subgoals, noisy_segments.level)
         motion_loss = process.loss(prediction, noisy_segments).mean()
         return subgoal_loss + motion_loss, read_losses(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
@@ -203,16 +200,16 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
     name = "chd"
 
     def _loss(
-        self, batch: dict[str, Tensor], network: HierarchicalPlanner, generator: Generator | None
+        self, batch: dict[str, Tensor], network: HierarchicalPlanner, noise: TrainingNoise
     ) -> tuple[Tensor, dict[str, float]]:
         """Each level's squared error, at the same step k, each conditioned on the other as in planning."""
         process = self.motion_process
         states, segments = self._states(batch), self._to_segments(self._motion(batch))
         state, subgoals = states[:, 0], states[:, 1:]
-        levels = self._sample_levels(process, len(state), generator)
-        noisy_subgoals = self._corrupt(process, subgoals, levels, generator)
-        noisy_segments = self._corrupt(process, segments, levels.repeat_interleave(self.config.num_segments), generator)
-        high, low = self._denoise_both(network, noisy_subgoals.value, noisy_segments.value, state, noisy_subgoals.level)
+        level = noise.level(process, len(state))
+        noisy_subgoals = noise.corrupt(process, subgoals, level)
+        noisy_segments = noise.corrupt(process, segments, level.repeat_interleave(self.config.num_segments))
+        high, low = self._denoise_both(network, noisy_subgoals.value, noisy_segments.value, state, level)
         subgoal_loss = process.loss(high, noisy_subgoals).mean()
         motion_loss = process.loss(low, noisy_segments).mean()
         return subgoal_loss + motion_loss, read_losses(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
