@@ -10,6 +10,7 @@ Example:
     add_symbolic_plans(LeRobotDataset("me/cups"), plans, "me/cups_with_plans", "outputs/cups_with_plans")
 """
 
+import shutil
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -46,10 +47,13 @@ def add_symbolic_plans(
             planner's. None: PAD and the symbols of these plans, in alphabetical order.
 
     Raises:
-        ValueError: there is not one plan for each episode, a step has the word PAD or one that the vocabulary lacks, a
-            word cannot be a symbol, or the steps of an episode are not done one after the other, between its first
-            frame and its end.
+        FileExistsError: the folder exists.
+        ValueError: there is not one plan for each episode, no plan has a step, a step has the word PAD or one that the
+            vocabulary lacks, a word cannot be a symbol, or the steps of an episode are not done one after the other,
+            between its first frame and its end.
     """
+    if Path(root).exists():
+        raise FileExistsError(f"{root} exists already: delete it, or choose another folder")
     if len(plans) != dataset.meta.total_episodes:
         raise ValueError(f"there are {len(plans)} plans for {dataset.meta.total_episodes} episodes")
     lengths = dataset.meta.episodes["length"]
@@ -57,6 +61,8 @@ def add_symbolic_plans(
         stops = [step.stop for step in plan]
         if any(stop <= earlier for earlier, stop in pairwise([0, *stops])) or max(stops, default=0) > length:
             raise ValueError(f"the stops of episode {episode} must strictly increase within 1..{length}, got {stops}")
+        if texts := [step.symbols for step in plan if isinstance(step.symbols, str)]:
+            raise ValueError(f"a step of episode {episode} is the text {texts[0]!r} instead of a tuple of words")
         if any(PAD in step.symbols for step in plan):
             raise ValueError(f"a step of episode {episode} has the word {PAD}, which only fills plans up")
     symbols = {symbol for plan in plans for step in plan for symbol in step.symbols}
@@ -65,9 +71,16 @@ def add_symbolic_plans(
     if unknown := symbols.difference(vocabulary):
         raise ValueError(f"the vocabulary {' '.join(vocabulary)} has no {', '.join(sorted(unknown))}")
     symbolic_horizon = max(sum(len(step.symbols) for step in plan) for plan in plans)
+    if symbolic_horizon == 0:
+        raise ValueError("no plan has a step: there is nothing to learn")
     token_ids = []
     for plan, length in zip(plans, lengths, strict=True):
         demonstration = Demonstration(np.empty((length, *dataset.meta.shapes[ACTION])), tuple(plan))
         token_ids += [demonstration.remaining_token_ids(frame, vocabulary, symbolic_horizon) for frame in range(length)]
     column = {"dtype": "int64", "shape": (symbolic_horizon,), "names": None, "info": {"vocabulary": vocabulary}}
-    return add_features(dataset, {SYMBOLIC_PLAN: (np.stack(token_ids), column)}, output_dir=root, repo_id=repo_id)
+    features = {SYMBOLIC_PLAN: (np.stack(token_ids), column)}
+    try:
+        return add_features(dataset, features, output_dir=root, repo_id=repo_id)
+    except BaseException:
+        shutil.rmtree(root, ignore_errors=True)  # half of a copy
+        raise

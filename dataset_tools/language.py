@@ -33,9 +33,11 @@ def write_language_columns(root: Path, vocabulary: Sequence[str]) -> None:
         vocabulary: the symbols, in the order of their ids.
 
     Raises:
-        ValueError: the dataset has language columns already.
+        ValueError: the dataset has no symbolic plans, or language columns already.
     """
     info = load_info(root)
+    if SYMBOLIC_PLAN not in info.features:
+        raise ValueError(f"{root} has no column {SYMBOLIC_PLAN}: add_symbolic_plans makes one")
     if LANGUAGE_PERSISTENT in info.features:
         raise ValueError(f"{root} has language columns already")
     info.features = {**info.features, **language_feature_info()}

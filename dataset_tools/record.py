@@ -155,6 +155,11 @@ class Shard(NamedTuple):
         """Exists when everything that the shard's folder holds was flushed to disk."""
         return self.root.with_suffix(".done")
 
+    @property
+    def lock_file(self) -> Path:
+        """Held by the process that records the shard."""
+        return self.root.with_suffix(".lock")
+
 
 def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
     """The environment's seed for an episode of a recording; a failed attempt is followed by another one.
@@ -272,14 +277,16 @@ def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = Non
     SIGTERM and Ctrl-C wait for the episode that is recorded; after SIGKILL, the shard begins again.
 
     Raises:
+        BlockingIOError: another process records it.
         InterruptedError: a signal has arrived, and its handler did not end the process.
     """
-    if is_complete(shard):
-        return
-    with deferred_signals() as signals:
-        _record_missing_episodes(config, shard, signals, progress)
-    if signals:
-        raise InterruptedError("interrupted; go on with --resume=true")
+    with one_process(shard.lock_file, f"records episodes {shard.start} to {shard.stop - 1} of {config.root}"):
+        if is_complete(shard):
+            return
+        with deferred_signals() as signals:
+            _record_missing_episodes(config, shard, signals, progress)
+        if signals:
+            raise InterruptedError("interrupted; go on with --resume=true")
 
 
 def _record_missing_episodes(config: RecordConfig, shard: Shard, signals: list[int], progress: tqdm | None) -> None:
@@ -366,20 +373,20 @@ def record(config: RecordConfig) -> LeRobotDataset:
         ValueError: the environment cannot be made, or the interrupted recording had other settings.
         OSError: another process records this dataset, or the upload failed.
     """
-    if (dataset := finish_earlier_recording(config)) is not None:
-        return dataset
-    try_environment(config)
     try:
         config.root.parent.mkdir(parents=True, exist_ok=True)
     except FileExistsError as error:
         raise NotADirectoryError(f"Not a directory: {config.root.parent}; choose another --dataset.root") from error
     with one_process(config.lock_file, f"records {config.root}"):
+        if (dataset := finish_earlier_recording(config)) is not None:
+            return dataset
+        try_environment(config)
         return _record(config)
 
 
 def _record(config: RecordConfig) -> LeRobotDataset:
     shards = plan_shards(config)
-    with tqdm(total=config.dataset.num_episodes, desc="Recording", unit="episode") as progress:
+    with tqdm(total=config.dataset.num_episodes, desc=f"Recording {config.env.task}", unit="episode") as progress:
         if config.num_workers == 1:
             for shard in shards:
                 if is_complete(shard):

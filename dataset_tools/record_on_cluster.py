@@ -22,6 +22,7 @@ from datatrove.executor import LocalPipelineExecutor, SlurmPipelineExecutor
 from draccus.utils import ParsingError
 from lerobot.configs import parser
 
+from .interruption import one_process
 from .record import (
     RecordConfig,
     Shard,
@@ -64,8 +65,10 @@ def record_task(config: RecordConfig, shards: list[Shard], _: Any, rank: int, wo
 
 
 def merge_task(config: RecordConfig, shards: list[Shard], _: Any, rank: int, world_size: int) -> None:
-    """The last task."""
-    merge_shards(config, shards)
+    """The last task, unless another run of the same command has done it meanwhile."""
+    with one_process(config.lock_file, f"records {config.root}"):
+        if finish_earlier_recording(config) is None:
+            merge_shards(config, shards)
 
 
 def record_on_cluster(config: ClusterRecordConfig) -> None:

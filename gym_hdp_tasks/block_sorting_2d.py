@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from .plan_rules import Observation, check_sorting_plan, slots_of_blocks
-from .task import PAD, PlanningTask, equal_steps
+from .task import PAD, RENDER_MODES, PlanningTask, draw_order, equal_steps
 
 # All lengths in metres.
 SLOT_SPACING = 0.15
@@ -111,7 +111,7 @@ class BlockSorting2DEnv(gym.Env):
         render_mode: None or `rgb_array`.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (gymnasium's own form)
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": FPS}  # noqa: RUF012 (gymnasium's own form)
 
     def __init__(self, n_blocks: int = 3, waypoints_per_pose: int = 3, render_mode: str | None = None):
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -149,14 +149,7 @@ class BlockSorting2DEnv(gym.Env):
             ValueError: the order is no permutation of the blocks.
         """
         super().reset(seed=seed)
-        order: np.ndarray = np.arange(self.n_blocks)
-        while np.array_equal(order, np.arange(self.n_blocks)):
-            order = self.np_random.permutation(self.n_blocks)
-        if options and "order" in options:
-            order = np.asarray(options["order"])
-            if sorted(order) != list(range(self.n_blocks)):
-                raise ValueError(f"order must be a permutation of 0..{self.n_blocks - 1}, got {order.tolist()}")
-            order = order.astype(int)
+        order = draw_order(self.np_random, self.n_blocks, options or {})
         offsets = self.np_random.uniform(-START_OFFSET, START_OFFSET, size=(self.n_blocks, 2))
         self.blocks = np.empty((self.n_blocks, 2))
         self.blocks[order] = self.slots[: self.n_blocks] + offsets

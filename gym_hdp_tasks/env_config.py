@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from .task import CAMERAS, OBS_TYPES, PlanningTask, parse_camera_names
+from .task import CAMERAS, OBS_TYPES, RENDER_MODES, ROBOTS, PlanningTask, parse_camera_names
 
 TASKS = {
     "BlockSorting2D-v0": "gym_hdp_tasks.block_sorting_2d:block_sorting_2d_task",
@@ -21,8 +21,9 @@ TASKS = {
 """Task name, as in `--env.task=`, to the function that states the task's facts. It is imported when the task is chosen:
 every command of LeRobot imports this module, also where there is no MuJoCo to be had."""
 BLOCK_SORTING_2D_ONLY = ("n_blocks", "waypoints_per_pose")
-XARM_ONLY = ("robot", "obs_type", "camera_name", "observation_height", "observation_width")
-"""Fields of `HDPEnv` that not every task has."""
+IMAGES_ONLY = ("camera_name", "observation_height", "observation_width")
+XARM_ONLY = ("robot", "obs_type", *IMAGES_ONLY)
+"""Fields of `HDPEnv` that not every task, or not every kind of observation, has."""
 
 
 @EnvConfig.register_subclass("hdp")
@@ -63,15 +64,23 @@ class HDPEnv(EnvConfig):
             cameras = parse_camera_names(self.camera_name)
         except ValueError as error:  # LeRobot's commands show the message of draccus' own error only
             raise ParsingError(str(error)) from error
-        if self.obs_type not in OBS_TYPES:
-            raise ParsingError(f"--env.obs_type must be one of {OBS_TYPES}, got {self.obs_type!r}")
+        for name, choices in (("robot", ROBOTS), ("obs_type", OBS_TYPES), ("render_mode", RENDER_MODES)):
+            if getattr(self, name) not in choices:
+                raise ParsingError(f"--env.{name} must be one of {choices}, got {getattr(self, name)!r}")
         self.camera_name = ",".join(cameras)
-        if self.obs_type == "state" and cameras != CAMERAS:
-            raise ParsingError("--env.camera_name chooses among images: add --env.obs_type=pixels, or pixels_state")
         others = BLOCK_SORTING_2D_ONLY if self._is_xarm else XARM_ONLY
         for field in fields(self):
-            if field.name in others and getattr(self, field.name) != field.default:
+            if getattr(self, field.name) == field.default:
+                continue
+            if field.name in others:
                 raise ParsingError(f"--env.{field.name} must be left out, {self.task} does not have it")
+            if field.name in IMAGES_ONLY and self.obs_type == "state":
+                raise ParsingError(f"--env.{field.name} is of images: add --env.obs_type=pixels, or pixels_state")
+        if min(self.observation_height, self.observation_width) < 1:
+            raise ParsingError(
+                "--env.observation_height and --env.observation_width must be at least 1 pixel, got "
+                f"{self.observation_height} and {self.observation_width}"
+            )
         if self.fps not in (EnvConfig.fps, task.fps):
             raise ParsingError(f"--env.fps must be left out, it is {task.fps} for {self.task}")
         self.fps = task.fps

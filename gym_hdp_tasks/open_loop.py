@@ -136,8 +136,10 @@ def main() -> None:
         if not isinstance(file, np.lib.npyio.NpzFile):
             raise ValueError(f"{options.plans} is one array, not an .npz file with `seeds` and `plans`")
         with file:
-            seeds, plans = file["seeds"].tolist(), file["plans"]
-        outcomes = execute_plans(f"hdp/{options.task}", seeds, plans, options.num_threads)
+            seeds, plans = file["seeds"], file["plans"]
+        if seeds.ndim != 1 or not len(seeds) or not np.issubdtype(seeds.dtype, np.integer):
+            raise ValueError(f"`seeds` must be (B,) integers, at least one, got {seeds.shape} {seeds.dtype}")
+        outcomes = execute_plans(f"hdp/{options.task}", seeds.tolist(), plans, options.num_threads)
     except (OSError, zipfile.BadZipFile, KeyError, ValueError, gym.error.Error) as error:
         sys.exit(f"open_loop: {error}")
     scores = [outcome["score"] for outcome in outcomes]

@@ -1,14 +1,19 @@
 """What every task states about itself: its words, its sizes and its units."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from .plan_rules import Observation
 
 FRONT_CAMERA, WRIST_CAMERA = CAMERAS = ("front", "wrist")
 OBS_TYPES = ("state", "pixels", "pixels_state")
 """What an X-Arm task can observe, and by which cameras."""
+ROBOTS = ("primitive", "menagerie")
+"""`primitive` ships with this package; `menagerie` is MuJoCo Menagerie's `ufactory_xarm7` (extra `menagerie`)."""
+RENDER_MODES = ("rgb_array",)
 PAD = "PAD"
 """Symbol with id 0: fills a plan that is shorter than the symbolic horizon."""
 
@@ -66,6 +71,32 @@ def parse_camera_names(camera_name: str | Sequence[str]) -> tuple[str, ...]:
     if not 0 < len(names) == len(set(names) & set(CAMERAS)):
         raise ValueError(f"camera_name must be one of {CAMERAS}, or several, as front,wrist; got {camera_name!r}")
     return names
+
+
+def draw_order(generator: np.random.Generator, n_blocks: int, options: Mapping[str, Any]) -> np.ndarray:
+    """Which block starts in which slot of a sorting task: a random order, but never the sorted one.
+
+    Args:
+        generator: the environment's; it draws an order even where one is given, so that all else stays the same.
+        n_blocks: how many there are.
+        options: of `reset`; `{"order": [...]}` gives the order, which may be any.
+
+    Returns:
+        (n_blocks,) int64, the block in each slot.
+
+    Raises:
+        ValueError: what is given is no permutation of the blocks.
+    """
+    in_order = np.arange(n_blocks)
+    order: np.ndarray = in_order
+    while np.array_equal(order, in_order):
+        order = generator.permutation(n_blocks)
+    if "order" not in options:
+        return order
+    given = np.asarray(options["order"])
+    if given.shape != (n_blocks,) or not np.array_equal(np.sort(given), in_order):
+        raise ValueError(f"order must be a permutation of 0..{n_blocks - 1}, got {options['order']}")
+    return given.astype(np.int64)
 
 
 def equal_steps(steps: int, tokens: int, waypoints: int) -> tuple[tuple[int, int], ...]:

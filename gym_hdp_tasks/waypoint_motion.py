@@ -101,8 +101,11 @@ class WaypointMotion:
         # q(s) = start + slope s + curvature s^2 goes through the three joint positions at s = 0, 1/2, 1.
         curvature = 2 * (start_joints + end_joints - 2 * middle_joints)
         slope = end_joints - start_joints - curvature
-        peak_speed = 1.5 * np.maximum(np.abs(slope), np.abs(slope + 2 * curvature)).max() / self._move_time
-        reached = min(1.0, MAX_JOINT_SPEED / max(peak_speed, 1e-9))
+        peak_speed = np.abs((slope + 2 * curvature * self._progress) * self._progress_rate).max()
+        reached = 1.0
+        if peak_speed > MAX_JOINT_SPEED:  # on a shorter way the direction peaks elsewhere: the bound for all of them
+            bound = 1.5 * np.maximum(np.abs(slope), np.abs(slope + 2 * curvature)).max() / self._move_time
+            reached = min(1.0, MAX_JOINT_SPEED / bound)
 
         s, rate = reached * self._progress, reached * self._progress_rate
         joints = start_joints + slope * s + curvature * s**2

@@ -9,10 +9,7 @@ from pathlib import Path
 
 import mujoco
 
-from .task import WRIST_CAMERA
-
-ROBOTS = ("primitive", "menagerie")
-"""`primitive` ships with this package; `menagerie` is MuJoCo Menagerie's `ufactory_xarm7` (extra `menagerie`)."""
+from .task import ROBOTS, WRIST_CAMERA
 
 ARM_JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 HOME_JOINTS = (0.0, -0.247, 0.0, 0.909, 0.0, 1.15644, 0.0)

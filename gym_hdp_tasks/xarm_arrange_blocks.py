@@ -89,13 +89,12 @@ class XArmArrangeBlocksEnv(XArmEnv):
         for name, colour in zip(BLOCKS, COLOURS, strict=True):
             add_block(spec, name, colour)
 
-    def place_objects(self, options: dict[str, Any]) -> None:
+    def draw_start(self, options: dict[str, Any]) -> np.ndarray:
         """Uniform over the places at which the gripper can take each block; takes no options."""
         positions = self.np_random.uniform(START_LOW, START_HIGH, size=(len(BLOCKS), 2))
         while not all(clear(positions[i], np.delete(positions, i, axis=0)) for i in range(len(BLOCKS))):
             positions = self.np_random.uniform(START_LOW, START_HIGH, size=(len(BLOCKS), 2))
-        for name, position in zip(BLOCKS, positions, strict=True):
-            self.set_object_pose(name, (*position, BLOCK_HALF_SIZE))
+        return np.column_stack([positions, np.full(len(BLOCKS), BLOCK_HALF_SIZE)])
 
     def score(self) -> float:
         """Fraction of slots that hold a block which lies on the table, let go by the gripper."""

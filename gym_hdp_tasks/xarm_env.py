@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from .scene import BLOCK_HALF_SIZE, FRONT_CAMERA_FOVY, furnish
-from .task import CAMERAS, FRONT_CAMERA, OBS_TYPES, PlanningTask, parse_camera_names
+from .task import CAMERAS, FRONT_CAMERA, OBS_TYPES, RENDER_MODES, PlanningTask, parse_camera_names
 from .waypoint_motion import WaypointMotion
 from .xarm7 import ARM_JOINTS, GRIPPERS, ROBOT_CONTYPE, TCP_SITE, robot_spec
 
@@ -49,7 +49,7 @@ class XArmEnv(gym.Env):
 
     Args:
         planning_task: the task's facts.
-        robot: one of `xarm7.ROBOTS`.
+        robot: one of `ROBOTS`.
         obs_type: one of `OBS_TYPES`.
         camera_name: the cameras to observe, from `CAMERAS`: `front,wrist`, or a sequence of names.
         observation_height: of an observed image, in pixels.
@@ -60,7 +60,7 @@ class XArmEnv(gym.Env):
         ValueError: one of these has a value that it cannot have.
     """
 
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (gymnasium's own form)
+    metadata = {"render_modes": list(RENDER_MODES)}  # noqa: RUF012 (gymnasium's own form)
 
     action_space: gym.spaces.Box
     object_names: tuple[str, ...]
@@ -136,8 +136,15 @@ class XArmEnv(gym.Env):
         """Add the task's objects to the scene: a free body and joint for each of `object_names`."""
         raise NotImplementedError
 
-    def place_objects(self, options: dict[str, Any]) -> None:
-        """Give each object its starting pose (`set_object_pose`), at random from `self.np_random`."""
+    def draw_start(self, options: dict[str, Any]) -> np.ndarray:
+        """Where each object starts, upright and square to the table, at random from `self.np_random`.
+
+        Args:
+            options: of `reset`.
+
+        Returns:
+            (n, 3) x, y, z of `object_names`, in metres.
+        """
         raise NotImplementedError
 
     def score(self) -> float:
@@ -151,14 +158,16 @@ class XArmEnv(gym.Env):
 
         Args:
             seed: seeds the environment's random generator.
-            options: what a task lets one fix; see its `place_objects`.
+            options: what a task lets one fix; see its `draw_start`.
 
         Raises:
             ValueError: an option that the task knows has a value that it cannot have.
         """
         super().reset(seed=seed)
+        start = self.draw_start(options or {})
         mujoco.mj_resetData(self.model, self.data)
-        self.place_objects(options or {})
+        for name, place in zip(self.object_names, start, strict=True):
+            self.set_object_pose(name, place)
         position = HOME + self.np_random.uniform(-HOME_OFFSET, HOME_OFFSET, size=3)
         self.data.qpos[self._arm_qpos] = self._motion.reset(np.array([*position, 1.0]))
         self.data.ctrl[:] = self._motion.hold()
@@ -239,7 +248,7 @@ class XArmEnv(gym.Env):
         """x, y, z in metres and unit quaternion (w, x, y, z) of each object: (n, 7)."""
         return self.data.qpos[self._object_qpos]
 
-    def set_object_pose(self, name: str, position: Sequence[float]) -> None:
+    def set_object_pose(self, name: str, position: Sequence[float] | np.ndarray) -> None:
         """Put an object at x, y, z in metres, upright and square to the table."""
         self.data.joint(name).qpos[:] = (*position, 1, 0, 0, 0)
 
@@ -273,7 +282,7 @@ class XArmEnv(gym.Env):
         if (height, width) not in self._renderers:
             try:
                 self._renderers[height, width] = mujoco.Renderer(self.model, height, width)
-            except (mujoco.FatalError, ImportError) as error:
+            except (mujoco.FatalError, ImportError, AttributeError) as error:  # the last with MUJOCO_GL=disable
                 raise OSError(
                     "cannot render images; without a display, MuJoCo needs EGL (Debian, Ubuntu: libegl1) and "
                     f"MUJOCO_GL=egl ({error})"

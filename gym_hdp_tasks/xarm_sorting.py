@@ -8,7 +8,7 @@ import numpy as np
 
 from .plan_rules import Observation, check_sorting_plan, slots_of_blocks
 from .scene import BLOCK_HALF_SIZE, BLUE, GREEN, GREY, RED, add_block, add_slot
-from .task import PAD, PlanningTask, equal_steps
+from .task import PAD, PlanningTask, draw_order, equal_steps
 from .xarm_env import POSE_NAMES, STATE_NAMES, XArmEnv, pose_names
 
 # All lengths in metres.
@@ -76,7 +76,7 @@ class XArmSortingEnv(XArmEnv):
         for name, colour in zip(BLOCKS, COLOURS, strict=True):
             add_block(spec, name, colour)
 
-    def place_objects(self, options: dict[str, Any]) -> None:
+    def draw_start(self, options: dict[str, Any]) -> np.ndarray:
         """A random unsorted order, each block off its slot's centre by up to START_OFFSET.
 
         Args:
@@ -85,19 +85,11 @@ class XArmSortingEnv(XArmEnv):
         Raises:
             ValueError: the order is no permutation of the blocks.
         """
-        n_blocks = len(BLOCKS)
-        sorted_order = list(range(n_blocks))
-        order = sorted_order
-        while order == sorted_order:
-            order = self.np_random.permutation(n_blocks).tolist()
-        if "order" in options:
-            order = list(options["order"])
-            if sorted(order) != sorted_order:
-                raise ValueError(f"order must be a permutation of 0..{n_blocks - 1}, got {order}")
-            order = [int(block) for block in order]
-        offsets = self.np_random.uniform(-START_OFFSET, START_OFFSET, size=(n_blocks, 2))
-        for slot, block in enumerate(order):
-            self.set_object_pose(BLOCKS[block], (*(SLOT_CENTRES[slot] + offsets[slot]), BLOCK_HALF_SIZE))
+        order = draw_order(self.np_random, len(BLOCKS), options)
+        offsets = self.np_random.uniform(-START_OFFSET, START_OFFSET, size=(len(BLOCKS), 2))
+        start = np.full((len(BLOCKS), 3), BLOCK_HALF_SIZE)
+        start[order, :2] = SLOT_CENTRES[: len(BLOCKS)] + offsets
+        return start
 
     def score(self) -> float:
         """Fraction of blocks that lie on the table in their own slot, let go by the gripper."""

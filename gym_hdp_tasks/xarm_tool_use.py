@@ -123,15 +123,14 @@ class XArmToolUseEnv(XArmEnv):
             add_block(spec, name, colour)
         add_hook(spec)
 
-    def place_objects(self, options: dict[str, Any]) -> None:
+    def draw_start(self, options: dict[str, Any]) -> np.ndarray:
         """Each block in a lane of its own, in random order, and the hook to the right; takes no options."""
         lanes = self.np_random.permutation(LANES)
         x = self.np_random.uniform(*BLOCK_START_X, size=len(BLOCKS))
         y = lanes + self.np_random.uniform(-LANE_OFFSET, LANE_OFFSET, size=len(BLOCKS))
-        for name, position in zip(BLOCKS, np.column_stack([x, y]), strict=True):
-            self.set_object_pose(name, (*position, BLOCK_HALF_SIZE))
+        blocks = np.column_stack([x, y, np.full(len(BLOCKS), BLOCK_HALF_SIZE)])
         handle = self.np_random.uniform(HOOK_START_LOW, HOOK_START_HIGH)
-        self.set_object_pose(HOOK, (*handle, HANDLE_HALF_SIZE[2]))
+        return np.array([*blocks, (*handle, HANDLE_HALF_SIZE[2])])
 
     def stack(self) -> tuple[str, ...]:
         """The blocks of the highest stack on the target, let go by the gripper, from bottom to top."""

@@ -70,6 +70,7 @@ def test_every_episode_needs_a_plan(without_plans, tmp_path):
         ([PICK._replace(stop=0)], "stops of episode 1"),
         ([PICK, PLACE._replace(stop=HORIZON + 1)], "stops of episode 1"),
         ([PICK, PlanStep(("PLACE", "PAD"), HORIZON)], "a step of episode 1 has the word PAD"),
+        ([PlanStep("PICK", 8)], "a step of episode 1 is the text 'PICK' instead of a tuple of words"),
     ],
 )
 def test_a_plan_that_no_episode_can_have_is_refused(without_plans, tmp_path, plan, message):
@@ -78,3 +79,14 @@ def test_a_plan_that_no_episode_can_have_is_refused(without_plans, tmp_path, pla
     with pytest.raises(ValueError, match=message):
         add_symbolic_plans(without_plans, plans, "test/with", tmp_path / "with")
     assert not (tmp_path / "with").exists()
+
+
+def test_plans_without_a_step_and_a_folder_that_is_taken_are_refused(without_plans, tmp_path):
+    empty = [[]] * without_plans.meta.total_episodes
+    with pytest.raises(ValueError, match="no plan has a step"):
+        add_symbolic_plans(without_plans, empty, "test/with", tmp_path / "with", ["PAD", "PICK"])
+    assert not (tmp_path / "with").exists()
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(FileExistsError, match="exists already"):
+        add_symbolic_plans(without_plans, [[PICK]] * len(empty), "test/with", tmp_path / "taken")
+    assert (tmp_path / "taken").exists()

@@ -131,8 +131,9 @@ def test_starts_in_the_order_that_it_is_given(order):
     env = make(2).unwrapped
     env.reset(seed=0, options={"order": order})
     assert env.blocks[0, 0] > env.blocks[1, 0]
-    with pytest.raises(ValueError, match="permutation"):
-        env.reset(options={"order": [0, 0.5]})
+    for wrong in ([0, 0.5], None, 3):
+        with pytest.raises(ValueError, match="permutation"):
+            env.reset(options={"order": wrong})
 
 
 @pytest.mark.parametrize(("offset", "counts"), [(0.99, True), (1.01, False)])

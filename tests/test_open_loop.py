@@ -87,6 +87,14 @@ def test_the_command_prints_scores_as_json_and_refuses_a_broken_file(plans, tmp_
     assert len(answer.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize("seeds", [np.zeros((2, 1), int), np.array([11.9, 3.0]), np.zeros(0, int)])
+def test_seeds_that_are_none_are_refused(plans, tmp_path, monkeypatch, seeds):
+    np.savez(tmp_path / "plans.npz", seeds=seeds, plans=plans[: len(seeds)])
+    monkeypatch.setattr(sys, "argv", ["open_loop", "XArmArrangeBlocks-v0", str(tmp_path / "plans.npz")])
+    with pytest.raises(SystemExit, match=r"^open_loop: `seeds` must be \(B,\) integers, at least one, got"):
+        main()
+
+
 def test_a_file_of_one_array_is_refused(tmp_path, monkeypatch):
     np.save(tmp_path / "plans.npy", np.zeros((1, 25, 4)))
     monkeypatch.setattr(sys, "argv", ["open_loop", "XArmArrangeBlocks-v0", str(tmp_path / "plans.npy")])

@@ -288,6 +288,33 @@ def test_a_dataset_is_recorded_by_one_process_at_a_time(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["sorting"]
 
 
+def test_a_recording_that_another_process_has_ended_meanwhile_is_not_repeated(tmp_path, monkeypatch):
+    config = replace(config_of(2, tmp_path / "sorting"), resume=True)
+    elsewhere, recorded = recorder.one_process, []
+
+    def another_was_faster(*arguments):
+        if not recorded:
+            recorded.append(True)
+            record(config)
+        return elsewhere(*arguments)
+
+    monkeypatch.setattr(recorder, "one_process", another_was_faster)
+    assert record(config).num_episodes == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["sorting"]
+
+
+def test_a_shard_is_recorded_by_one_process_at_a_time(tmp_path):
+    """Another job of a cluster has it, which no lock on the whole recording keeps away."""
+    config = config_of(2, tmp_path / "sorting")
+    [shard, *_] = plan_shards(config)
+    with (
+        one_process(shard.lock_file, "records it"),
+        pytest.raises(BlockingIOError, match=r"another process records episodes 0 to \d+ of .*sorting: wait"),
+    ):
+        recorder.record_shard(config, shard)
+    assert not shard.root.exists()
+
+
 def test_an_interrupted_recording_goes_on_with_the_same_settings_only(tmp_path):
     config = config_of(2, tmp_path / "stopped")
     plan_shards(config)

@@ -230,6 +230,37 @@ def test_a_parameter_that_a_task_does_not_have_is_refused(parameters):
         HDPEnv(**parameters)
 
 
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"robot": "primitve"}, r"--env.robot must be one of \('primitive', 'menagerie'\), got 'primitve'"),
+        ({"obs_type": "image"}, "--env.obs_type must be one of"),
+        ({"render_mode": "human"}, "--env.render_mode must be one of"),
+        ({"observation_height": 64}, "--env.observation_height is of images: add --env.obs_type=pixels"),
+        ({"observation_width": 0, "obs_type": "pixels"}, "must be at least 1 pixel, got 128 and 0"),
+    ],
+)
+def test_a_value_that_no_environment_has_is_refused_before_one_is_made(parameters, message):
+    with pytest.raises(ParsingError, match=message):
+        HDPEnv(task="XArmSorting-v0", **parameters)
+
+
+@pytest.mark.parametrize("order", [[0, 0, 1], [0, 1], 5, None, [[0, 1, 2]]])
+def test_a_start_that_is_refused_leaves_the_episode_as_it_was(order):
+    env = gym.make("hdp/XArmSorting-v0").unwrapped
+    env.reset(seed=0)
+    before = env.data.qpos.copy()
+    with pytest.raises(ValueError, match=r"order must be a permutation of 0\.\.2, got"):
+        env.reset(options={"order": order})
+    assert np.array_equal(env.data.qpos, before)
+
+
+def test_a_start_in_a_given_order():
+    env = gym.make("hdp/XArmSorting-v0").unwrapped
+    env.reset(seed=0, options={"order": [2, 0, 1]})
+    assert np.argsort(-env.object_poses()[:, 1]).tolist() == [2, 0, 1]
+
+
 @pytest.mark.parametrize("task", ["XArmSorting-v0", "BlockSorting2D-v0"])
 def test_a_config_that_was_saved_loads_again(task):
     saved = asdict(HDPEnv(task=task))
@@ -313,7 +344,8 @@ def test_cameras_have_the_size_that_was_asked_for():
 @pytest.mark.parametrize("obs_type", OBS_TYPES)
 @pytest.mark.parametrize("gym_id", IDS)
 def test_lerobot_sees_the_features_that_the_config_announces(gym_id, obs_type):
-    config = HDPEnv(task=gym_id.removeprefix("hdp/"), obs_type=obs_type, observation_height=32, observation_width=32)
+    size = {} if obs_type == "state" else {"observation_height": 32, "observation_width": 32}
+    config = HDPEnv(task=gym_id.removeprefix("hdp/"), obs_type=obs_type, **size)
     vector_env = make_env(config, n_envs=1, use_async_envs=False)["hdp"][0]
     observation, _ = vector_env.reset(seed=[0])
     batch = preprocess_observation(observation)
