@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from .plan import TOKENS_PER_ROW, PlanRow
+
 MASK_WORD = ""
 """How a masked token is given to `draw_symbols`: it becomes an empty box."""
 
@@ -27,6 +29,7 @@ class PlanPicture(NamedTuple):
         path: (H, 2) pixel coordinates of the waypoints in it.
         gripper: (H,) gripper opening of each waypoint; waypoints with a closed gripper are drawn filled.
         words: one word for each token, `MASK_WORD` where it is still masked; without PAD at the end.
+        rows: in which they are written.
         given: which words the prompt gave, or None.
         caption: a line above the symbols.
     """
@@ -35,24 +38,25 @@ class PlanPicture(NamedTuple):
     path: np.ndarray
     gripper: np.ndarray
     words: Sequence[str]
+    rows: Sequence[PlanRow]
     given: Sequence[bool] | None = None
     caption: str = ""
 
 
-def draw_plan(picture: PlanPicture, symbol_rows: int, words_per_row: int = 6) -> Image.Image:
-    """The motion over the scene, and the symbolic plan beneath it, in rows of a fixed number of words."""
+def draw_plan(picture: PlanPicture) -> Image.Image:
+    """The motion over the scene, and the symbolic plan beneath it."""
     scale = SCENE_HEIGHT / picture.scene.shape[0]
     width = round(picture.scene.shape[1] * scale)
     scene = cv2.resize(picture.scene, (width, SCENE_HEIGHT), interpolation=cv2.INTER_CUBIC)
     draw_motion(scene, picture.path * scale, picture.gripper)
 
     row_height = BOX_HEIGHT + BOX_GAP
-    canvas = Image.new("RGB", (width, SCENE_HEIGHT + row_height * (symbol_rows + 1) + 2 * MARGIN), PAPER)
+    canvas = Image.new("RGB", (width, SCENE_HEIGHT + row_height * (len(picture.rows) + 1) + 2 * MARGIN), PAPER)
     canvas.paste(Image.fromarray(scene))
     draw = ImageDraw.Draw(canvas)
     top = SCENE_HEIGHT + MARGIN
     draw.text((MARGIN, top), picture.caption, fill=INK, font=ImageFont.load_default(FONT_SIZE))
-    draw_symbols(draw, picture.words, picture.given, (MARGIN, top + row_height), width - 2 * MARGIN, words_per_row)
+    draw_symbols(draw, picture, (MARGIN, top + row_height), width - 2 * MARGIN)
     return canvas
 
 
@@ -68,26 +72,20 @@ def draw_motion(image: np.ndarray, path: np.ndarray, gripper: np.ndarray) -> Non
         cv2.circle(image, point, 6, colour, cv2.FILLED if opening < GRIPPER_CLOSED_BELOW else 2, cv2.LINE_AA)
 
 
-def draw_symbols(
-    draw: ImageDraw.ImageDraw,
-    words: Sequence[str],
-    given: Sequence[bool] | None,
-    origin: tuple[int, int],
-    width: int,
-    words_per_row: int,
-) -> None:
+def draw_symbols(draw: ImageDraw.ImageDraw, picture: PlanPicture, origin: tuple[int, int], width: int) -> None:
     """A box for each token; masked ones are empty, those of the prompt tinted."""
     font = ImageFont.load_default(FONT_SIZE)
-    box_width = (width - BOX_GAP * (words_per_row - 1)) / words_per_row
-    for position, word in enumerate(words):
-        row, column = divmod(position, words_per_row)
-        left = origin[0] + column * (box_width + BOX_GAP)
-        top = origin[1] + row * (BOX_HEIGHT + BOX_GAP)
-        masked = word == MASK_WORD
-        fill = FAINT if masked else (GIVEN if given is not None and given[position] else "white")
-        draw.rounded_rectangle((left, top, left + box_width, top + BOX_HEIGHT), 6, fill=fill, outline=FAINT)
-        centre = (left + box_width / 2, top + BOX_HEIGHT / 2)
-        draw.text(centre, word, fill=INK, font=font, anchor="mm")
+    columns = max([TOKENS_PER_ROW, *(row.tokens.stop - row.tokens.start for row in picture.rows)])
+    box_width = (width - BOX_GAP * (columns - 1)) / columns
+    for number, row in enumerate(picture.rows):
+        top = origin[1] + number * (BOX_HEIGHT + BOX_GAP)
+        for column, position in enumerate(range(row.tokens.start, row.tokens.stop)):
+            word, left = picture.words[position], origin[0] + column * (box_width + BOX_GAP)
+            given = picture.given is not None and picture.given[position]
+            fill = FAINT if word == MASK_WORD else GIVEN if given else "white"
+            draw.rounded_rectangle((left, top, left + box_width, top + BOX_HEIGHT), 6, fill=fill, outline=FAINT)
+            centre = (left + box_width / 2, top + BOX_HEIGHT / 2)
+            draw.text(centre, word, fill=INK, font=font, anchor="mm")
 
 
 def save_animation(frames: Sequence[Image.Image], path, frame_ms: int = 60, last_frame_ms: int = 2500) -> None:

@@ -4,6 +4,32 @@
 """
 
 import logging
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+
+def read_metadata(source: "DatasetConfig") -> "LeRobotDatasetMetadata":
+    """The metadata of a dataset, or one sentence about what is wrong.
+
+    LeRobot looks for a dataset that is not in its folder on the Hub, and lets the user read how that failed.
+
+    Raises:
+        ValueError: it is in neither.
+    """
+    from httpx import HTTPError
+    from lerobot.datasets import LeRobotDatasetMetadata  # not where the plugin is only discovered
+
+    try:
+        return LeRobotDatasetMetadata(source.repo_id, root=source.root, revision=source.revision)
+    except (OSError, HTTPError) as error:
+        where = "in LeRobot's cache" if source.root is None else f"in {source.root}"
+        raise ValueError(
+            f"the dataset {source.repo_id} is not {where}, nor to be had from the Hub: name another by "
+            f"--dataset.repo_id and --dataset.root, or record it with hdp-record ({error})"
+        ) from error
 
 
 def keep_data_order_on_resume() -> None:

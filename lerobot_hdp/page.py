@@ -4,14 +4,13 @@ import base64
 import io
 import json
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
 
-from .plan import StepEnds
+from .plan import StepEnds, plan_rows
 
 TEMPLATE = Path(__file__).with_name("plan_page.html")
 IMAGE_QUALITY = 80
@@ -78,24 +77,18 @@ def write_page(page: PlanPage, path: Path) -> None:
         "gripper": final.gripper.round(2).tolist(),
         "probabilities": [round(probability, 2) for probability in page.probabilities],
         "given": list(page.given),
-        "steps": _steps(len(final.words), page.step_ends),
+        "steps": [
+            {"tokens": _bounds(row.tokens)} | ({"waypoints": _bounds(row.waypoints)} if row.waypoints else {})
+            for row in plan_rows(len(final.words), len(final.path), page.step_ends)
+        ],
     }
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(TEMPLATE.read_text(encoding="utf-8").replace("PLAN_DATA;", text + ";"), encoding="utf-8")
 
 
-def _steps(length: int, step_ends: StepEnds | None, tokens_per_row: int = 6) -> list[dict[str, Any]]:
-    """The tokens of each row, and its waypoints where they are known."""
-    if step_ends is None:
-        return [{"tokens": [i, min(i + tokens_per_row, length)]} for i in range(0, length, tokens_per_row)]
-    rows: list[dict[str, Any]] = [
-        {"tokens": [tokens, min(next_tokens, length)], "waypoints": [first, stop]}
-        for (tokens, first), (next_tokens, stop) in pairwise([(0, 0), *step_ends])
-        if tokens < length
-    ]
-    beyond = step_ends[-1][0]
-    return [*rows, {"tokens": [beyond, length]}] if beyond < length else rows
+def _bounds(part: slice) -> list[int]:
+    return [part.start, part.stop]
 
 
 def _data_url(image: np.ndarray) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +16,8 @@ PlanCheck = Callable[[int, list[str]], list[str]]
 StepEnds = Sequence[tuple[int, int]]
 """(tokens, waypoints) until which each step of a plan lasts, e.g. ((6, 7), (12, 13)): the first step is the tokens 0
 to 5 and the waypoints 0 to 6. Tasks whose demonstrations all keep the same time know it (`PlanningTask.step_ends`)."""
+TOKENS_PER_ROW = 6
+"""Where a plan is written and its steps are not known."""
 
 
 @dataclass(frozen=True)
@@ -165,8 +167,8 @@ class Plan:
 
         Args:
             index: of the sample.
-            step_ends: the tokens and waypoints of each step, to say which waypoints it covers; None: six tokens to a
-                line, without waypoints.
+            step_ends: the tokens and waypoints of each step, to say which waypoints it covers; None: `TOKENS_PER_ROW`
+                to a line, without waypoints.
         """
         words = self.symbols(index)
         if not words:
@@ -175,16 +177,47 @@ class Plan:
         if self.token_probabilities is not None and self.token_probabilities.shape[1]:
             drawn = zip(words, self.token_probabilities[index].tolist(), strict=False)
             tokens = [f"{word} {probability:.2f}" for word, probability in drawn]
-        if step_ends is None:
-            return "\n".join("  ".join(tokens[start : start + 6]) for start in range(0, len(tokens), 6))
         lines = []
-        for (first_token, first), (next_token, stop) in pairwise([(0, 0), *step_ends]):
-            if tokens[first_token:next_token]:
-                waypoints = f"waypoints {first}-{stop - 1}"
-                lines.append(f"{waypoints:18}" + "  ".join(tokens[first_token:next_token]))
-        if beyond := tokens[step_ends[-1][0] :]:
-            lines.append(f"{'after the motion':18}" + "  ".join(beyond))
+        for row in plan_rows(len(tokens), self.actions.shape[1], step_ends):
+            line = "  ".join(tokens[row.tokens])
+            if step_ends is not None:
+                during = row.waypoints
+                when = f"waypoints {during.start}-{during.stop - 1}" if during else "after the motion"
+                line = f"{when:18}{line}"
+            lines.append(line)
         return "\n".join(lines)
 
     def __str__(self) -> str:
         return "\n\n".join(self.describe(index) for index in range(len(self.actions)))
+
+
+class PlanRow(NamedTuple):
+    """A line of a plan that is written or drawn.
+
+    Attributes:
+        tokens: its tokens.
+        waypoints: of its step; None: not known, or it comes after the motion.
+    """
+
+    tokens: slice
+    waypoints: slice | None
+
+
+def plan_rows(num_tokens: int, horizon: int, step_ends: StepEnds | None = None) -> list[PlanRow]:
+    """The lines in which a plan is written: one for each step, and one for what follows the last.
+
+    Args:
+        num_tokens: of the plan, without PAD at its end.
+        horizon: H_c; a planner of short motions plans steps that come after its motion, too.
+        step_ends: the tokens and waypoints of each step; None: `TOKENS_PER_ROW` to a line.
+    """
+    if step_ends is None:
+        starts = range(0, num_tokens, TOKENS_PER_ROW)
+        return [PlanRow(slice(start, min(start + TOKENS_PER_ROW, num_tokens)), None) for start in starts]
+    rows = []
+    for (start, first), (stop, end) in pairwise([(0, 0), *step_ends, (num_tokens, 0)]):
+        waypoints = slice(first, min(end, horizon))
+        if start < min(stop, num_tokens):
+            has_waypoints = waypoints.start < waypoints.stop
+            rows.append(PlanRow(slice(start, min(stop, num_tokens)), waypoints if has_waypoints else None))
+    return rows

@@ -3,6 +3,8 @@
 The environment says what a motion does. A rate is over the 40 unseen starts of the fixture.
 """
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -177,4 +179,6 @@ def test_a_plan_prints_as_words_with_waypoints_and_probabilities(trained):
     assert [line[:15].rstrip() for line in rest] == ["waypoints 7-12", "waypoints 13-18"]
     assert "PICK A S2 PLACE A" in " ".join(word for word in rest[0].split() if not word.startswith(("0.", "1.")))
     assert plan.describe(3).count("\n") == 2
+    short = replace(plan, actions=plan.actions[:, :10]).describe(3, [(6, 7), (12, 13)])
+    assert [line[:18].rstrip() for line in short.splitlines()] == ["waypoints 0-6", "waypoints 7-9", "after the motion"]
     assert str(plan).count("PICK") == 120

@@ -17,12 +17,11 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from draccus.utils import ParsingError
-from httpx import HTTPError
 from lerobot import envs, policies  # noqa: F401 (registers LeRobot's own)
 from lerobot.configs import PolicyFeature, PreTrainedConfig, parser
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors, preprocess_observation
 from lerobot.policies import get_policy_class, make_pre_post_processors
@@ -35,13 +34,13 @@ from torch import Tensor
 
 from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
 from lerobot_hdp.drawing import MASK_WORD, PlanPicture, draw_plan, save_animation
+from lerobot_hdp.lerobot_workarounds import read_metadata
 from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.page import PageState, PlanPage, write_page
-from lerobot_hdp.plan import Plan, PlanPrompt
+from lerobot_hdp.plan import Plan, PlanPrompt, StepEnds, plan_rows
 from lerobot_hdp.sampling import DenoisingState
 from lerobot_hdp.vocabulary import Vocabulary
 
-WORDS_PER_ROW = 6
 MOST_STATES = 40
 """Denoising steps that are drawn."""
 
@@ -91,6 +90,8 @@ class PlanConfig:
             )
         if self.explain is not None and (self.prompt or self.html or self.check):
             raise ValueError("--explain goes without --prompt, --html and --check: nothing is planned")
+        if self.html is not None and self.html.is_dir():
+            raise ValueError(f"--html={self.html} is a folder: name a file in it, such as {self.html / 'plan.html'}")
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
@@ -186,10 +187,10 @@ def make_plan(config: PlanConfig) -> Result:
             given = plan.tokens_given[0, : len(given)].tolist()
 
         config.output_dir.mkdir(parents=True, exist_ok=True)
-        files = _draw(config, start, states, given)
+        step_ends = task.step_ends if task else None
+        files = _draw(config, start, states, given, step_ends)
         outcome, frames = _execute(env, unnormalise(plan.actions[0]), render=config.html is not None)
         complaints = check(0, plan.symbols()) if task and policy.vocabulary else None
-        step_ends = task.step_ends if task else None
         if config.html is not None:
             probabilities = plan.token_probabilities[0, : len(given)].tolist()
             about = [outcome, f"seed {config.seed}", *(complaints or [])]
@@ -216,12 +217,9 @@ def explain(config: PlanConfig) -> str:
     source = config.dataset
     if source is None:
         raise ValueError("the checkpoint names no dataset: choose one with --dataset.repo_id=... --dataset.root=...")
-    try:
-        where = {"root": source.root, "revision": source.revision}
-        windows = resolve_delta_timestamps(policy.config, LeRobotDatasetMetadata(source.repo_id, **where))
-        dataset = LeRobotDataset(source.repo_id, delta_timestamps=windows, video_backend="pyav", **where)
-    except (OSError, HTTPError) as error:
-        raise ValueError(f"the dataset {source.repo_id} is not in {source.root}, nor to be had: {error}") from error
+    windows = resolve_delta_timestamps(policy.config, read_metadata(source))
+    where = {"root": source.root, "revision": source.revision}
+    dataset = LeRobotDataset(source.repo_id, delta_timestamps=windows, video_backend="pyav", **where)
     features = dataset_to_policy_features(dataset.meta.features)
     for key, feature in {**policy.config.input_features, **policy.config.output_features}.items():
         shape = features[key].shape if key in features else None
@@ -292,13 +290,15 @@ def _size(features: dict[str, PolicyFeature], key: str) -> int | None:
     return features[key].shape[0] if key in features else None
 
 
-def _draw(config: PlanConfig, scene: np.ndarray, states: list[PageState], given: list[bool]) -> dict[str, Path]:
+def _draw(
+    config: PlanConfig, scene: np.ndarray, states: list[PageState], given: list[bool], step_ends: StepEnds | None
+) -> dict[str, Path]:
     """Write `plan.png` and `denoising.gif`."""
-    rows = -(-len(states[-1].words) // WORDS_PER_ROW)
+    rows = plan_rows(len(states[-1].words), len(states[-1].path), step_ends)
 
     def picture(state: PageState, caption: str):
         words = [MASK_WORD if word is None else word for word in state.words]
-        return draw_plan(PlanPicture(scene, state.path, state.gripper, words, given, caption), rows)
+        return draw_plan(PlanPicture(scene, state.path, state.gripper, words, rows, given, caption))
 
     files = {"picture": config.output_dir / "plan.png", "animation": config.output_dir / "denoising.gif"}
     picture(states[-1], f"plan from seed {config.seed}").save(files["picture"])
