@@ -117,6 +117,9 @@ class HDPPolicy(PreTrainedPolicy):
             the horizon. With it, a new policy's image encoders start from `pretrained_backbone_weights`; a checkpoint
             has weights of its own.
         kwargs: `from_pretrained` hands over what was meant for the configuration, such as `cli_overrides`.
+
+    Raises:
+        ValueError: the configuration is another planner's, or incomplete, or does not fit the dataset.
     """
 
     config_class = HDPConfig
@@ -125,6 +128,11 @@ class HDPPolicy(PreTrainedPolicy):
     """Whether it can say how likely a plan is, and so choose among candidates."""
 
     def __init__(self, config: HDPConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any):
+        if config.type != self.name:
+            raise ValueError(
+                f"this is a planner of type {config.type}: load it by lerobot.policies.get_policy_class("
+                f"'{config.type}').from_pretrained(...)"
+            )
         super().__init__(config)
         config.validate_features()
         if dataset_stats is not None:

@@ -35,7 +35,7 @@ class ObservationShapesProcessorStep(ObservationProcessorStep):
             nothing is said here.
 
     Raises:
-        ValueError: an observation is missing or has another shape.
+        ValueError: an observation is missing, is no tensor, or has another shape.
     """
 
     shapes: dict[str, list[int | None]] = field(default_factory=dict)
@@ -44,6 +44,9 @@ class ObservationShapesProcessorStep(ObservationProcessorStep):
         for key, shape in self.shapes.items():
             if key not in observation:
                 raise ValueError(f"the planner was trained on {key}, which is not observed here")
+            if not isinstance(observation[key], Tensor):
+                kind = type(observation[key]).__name__
+                raise ValueError(f"{key} is a {kind}: make it a torch.Tensor, float32, which LeRobot's processors read")
             found = list(observation[key].shape[-len(shape) :])
             fits = all(wanted in (None, size) for wanted, size in zip(shape, found, strict=False))
             if shape != [1] and not (fits and len(found) == len(shape)):
@@ -72,7 +75,7 @@ class SymbolicPlanProcessorStep(ObservationProcessorStep):
         vocabulary_size: m.
 
     Raises:
-        ValueError: a plan that is too long or, on a CPU, holds a token id that is no symbol's.
+        ValueError: a plan that is empty or too long, or holds what is no integer or, on a CPU, no symbol's token id.
     """
 
     symbolic_horizon: int | None = None
@@ -82,11 +85,14 @@ class SymbolicPlanProcessorStep(ObservationProcessorStep):
         plan = observation.pop(OBS_SYMBOLIC_PLAN, None)
         if plan is None or self.symbolic_horizon is None:
             return observation
-        plan = torch.as_tensor(plan).long()
+        plan = torch.as_tensor(plan)
+        if plan.is_floating_point():
+            raise ValueError(f"{OBS_SYMBOLIC_PLAN} must hold token ids, which are integers, got {plan.dtype}")
+        plan = plan.long()
         if plan.ndim == 1:  # one sample; or a batch of plans of one token, which LeRobot stores as numbers
             plan = plan.unsqueeze(1 if self.symbolic_horizon == 1 else 0)
-        if plan.shape[1] > self.symbolic_horizon:
-            raise ValueError(f"a plan of {plan.shape[1]} tokens is longer than {self.symbolic_horizon=}")
+        if not 0 < plan.shape[1] <= self.symbolic_horizon:
+            raise ValueError(f"a plan has 1 to {self.symbolic_horizon} tokens, got {plan.shape[1]}")
         unknown = (plan < FREE_SYMBOL) | (plan >= self.vocabulary_size)
         # On a GPU the host would wait for the answer at every training step; its kernels check the ids themselves.
         if plan.device.type == "cpu" and unknown.any():

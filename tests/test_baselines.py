@@ -217,6 +217,11 @@ class TestContract:
         assert torch.equal(plans[0].actions, plans[1].actions)
         assert plans[0].symbols() == plans[1].symbols()
 
+    def test_a_checkpoint_is_not_loaded_by_the_class_of_another_planner(self, make_planner, planner, tmp_path):
+        make_planner(planner)[0].save_pretrained(tmp_path)
+        with pytest.raises(ValueError, match=rf"of type {planner}: load it by .*get_policy_class\('{planner}'\)"):
+            get_policy_class("diffuser" if planner == "hdp" else "hdp").from_pretrained(tmp_path)
+
     def test_the_noise_of_a_training_step_is_in_the_checkpoint(self, make_planner, training_batch, planner, tmp_path):
         """So that a resumed run goes on exactly as if never interrupted."""
         policy, preprocessor, _ = make_planner(planner, dropout=0.5)

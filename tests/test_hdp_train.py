@@ -232,6 +232,12 @@ def test_the_held_out_dataset_counts_in_the_budget(dataset_root, open_datasets, 
     assert [isinstance(dataset, InMemoryDataset) for dataset in datasets] == [held, held]
 
 
+def test_a_dataset_that_is_nowhere_is_an_error_of_one_sentence(tmp_path):
+    with pytest.raises(ValueError, match=r"test/dataset is not in .*nowhere, nor to be had from the Hub: name another"):
+        train(hdp_train.main, tmp_path / "nowhere", tmp_path / "run", PLANNER_FLAGS)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("flag", ["--max_train_minutes", "--max_memory_gib"])
 @pytest.mark.parametrize("value", ["-1", "nan"])
 def test_a_limit_below_zero_is_refused(monkeypatch, capsys, flag, value):
@@ -314,9 +320,9 @@ def test_a_horizon_that_is_looked_up_has_to_go_with_the_rest(dataset_root, tmp_p
 def test_a_run_that_is_out_of_time_leaves_a_checkpoint_and_goes_on_from_it(dataset_root, lerobot_train_run, tmp_path):
     run = tmp_path / "run"
     log = train(hdp_train.main, dataset_root, run, PLANNER_FLAGS, "--max_train_minutes=0")
-    assert "Go on with --resume=true" in log
-    assert [path.name for path in (run / "checkpoints").iterdir() if not path.is_symlink()] == ["000001"]
     config = run / "checkpoints/last/pretrained_model/train_config.json"
+    assert f"To go on: hdp-train --resume=true --config_path={config} " in log
+    assert [path.name for path in (run / "checkpoints").iterdir() if not path.is_symlink()] == ["000001"]
     run_command("hdp-train", f"--config_path={config}", "--resume=true", "--max_train_minutes=60")
     assert_same_weights(weights(run), weights(lerobot_train_run[1]))
 

@@ -448,11 +448,10 @@ def test_noise_of_poses_that_cannot_be_is_refused(make_planner, options, message
         make_planner(**options)
 
 
-def test_a_cpu_without_bfloat16_computes_in_float32_with_a_warning(monkeypatch):
+def test_a_cpu_without_bfloat16_computes_in_float32_with_a_warning(monkeypatch, caplog):
     monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
-    with pytest.warns(UserWarning, match="no bfloat16 instructions"):
-        config = HDPConfig(dtype="bfloat16", device="cpu")
-    assert config.dtype == "float32"
+    assert HDPConfig(dtype="bfloat16", device="cpu").dtype == "float32"
+    assert "no bfloat16 instructions" in caplog.text
 
 
 @pytest.mark.parametrize("trains", [True, False])
@@ -544,6 +543,7 @@ class TestBadInput:
                 lambda state: {"observation.environment_state": state[:, :3]},
                 r"was trained on observation.environment_state of shape \[\d+\], here it has \[3\]",
             ),
+            (lambda state: {"observation.environment_state": state.numpy()}, "is a ndarray: make it a torch.Tensor"),
         ],
     )
     def test_observations_of_another_task(self, make_planner, batch, change, message):
@@ -551,6 +551,19 @@ class TestBadInput:
         state = batch.pop("observation.environment_state")
         with pytest.raises(ValueError, match=message):
             preprocessor({**batch, **change(state)})
+
+    @pytest.mark.parametrize(
+        ("plan", "message"),
+        [
+            (torch.zeros(2, 0, dtype=torch.int64), "a plan has 1 to 5 tokens, got 0"),
+            (torch.zeros(2, 6, dtype=torch.int64), "a plan has 1 to 5 tokens, got 6"),
+            (torch.full((2, 5), 1.7), "must hold token ids, which are integers, got torch.float32"),
+        ],
+    )
+    def test_a_plan_that_is_none(self, plan, message):
+        step = SymbolicPlanProcessorStep(symbolic_horizon=5, vocabulary_size=3)
+        with pytest.raises(ValueError, match=message):
+            step.observation({OBS_SYMBOLIC_PLAN: plan})
 
     def test_token_ids_on_a_device_are_not_read(self):
         """The host would wait for them. A meta tensor has nothing to read."""

@@ -18,6 +18,7 @@ import gc
 import logging
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import datasets
@@ -25,7 +26,7 @@ import numpy as np
 import torch
 from lerobot.configs import FeatureType
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch.distributed import ProcessGroup
@@ -33,7 +34,7 @@ from torch.utils.data import Dataset, Subset
 
 from lerobot_hdp.configuration_hdp import HDPConfig
 from lerobot_hdp.in_memory_dataset import Batch, InMemoryDataset, memory_needed, unsupported
-from lerobot_hdp.lerobot_workarounds import keep_data_order_on_resume
+from lerobot_hdp.lerobot_workarounds import keep_data_order_on_resume, read_metadata
 
 GIB = 2**30
 
@@ -71,6 +72,7 @@ class Replacements:
         self.max_memory_gib = max_memory_gib
         self.deadline = None if max_train_minutes is None else time.monotonic() + 60 * max_train_minutes
         self.out_of_time = False
+        self.output_dir: Path | None = None
         self.users_num_workers: int | None = None
         self.process_group: ProcessGroup | None = None
         self._open = lerobot_train.make_train_eval_datasets
@@ -91,7 +93,7 @@ class Replacements:
         """Open the datasets in memory, if they fit; for planners of whole episodes, let plans begin at first frames.
 
         Raises:
-            ValueError: training time is limited, and no checkpoints are written.
+            ValueError: there is no such dataset; or training time is limited, and no checkpoints are written.
         """
         if self.deadline is not None and not cfg.save_checkpoint:
             raise ValueError("--max_train_minutes ends with a checkpoint: it needs --save_checkpoint=true")
@@ -100,8 +102,11 @@ class Replacements:
             # threads of Gloo while it has the interpreter's lock, for which one of them may be waiting: the process
             # would hang at its very end. Python's own reference frees the lock.
             self.process_group = torch.distributed.group.WORLD
+        self.output_dir = cfg.output_dir
+        meta = read_metadata(cfg.dataset)
         if isinstance(cfg.policy, HDPConfig) and cfg.policy.horizon is None:
-            cfg.policy.set_horizon(_longest_episode(cfg))
+            cfg.policy.set_horizon(max(meta.episodes["length"]))
+            logging.info("The horizon is %d, the length of the longest episode", cfg.policy.horizon)
 
         train, held_out = self._open(cfg)
         # LeRobot renames observations before it normalises them, and not their statistics.
@@ -159,15 +164,6 @@ class Replacements:
             ValueError: always.
         """
         raise ValueError(f"hdp-train trains on this machine: with --job.target={cfg.job.target}, use lerobot-train")
-
-
-def _longest_episode(cfg: TrainPipelineConfig) -> int:
-    """Frames of the longest episode of a dataset."""
-    source = cfg.dataset
-    meta = LeRobotDatasetMetadata(source.repo_id, root=source.root, revision=source.revision)
-    longest = max(meta.episodes["length"])
-    logging.info("The horizon is %d, the length of the longest episode", longest)
-    return longest
 
 
 def _first_frames(dataset: Dataset) -> Subset:
@@ -241,8 +237,11 @@ def main() -> None:
         lerobot_train.main()
     except OutOfTimeError:
         logging.info(
-            "Out of time after %g minutes. Go on with --resume=true. Only a finished training is pushed to the Hub.",
+            "Out of time after %g minutes. To go on: hdp-train --resume=true "
+            "--config_path=%s/checkpoints/last/pretrained_model/train_config.json (and only a finished training is "
+            "pushed to the Hub)",
             options.max_train_minutes,
+            replacements.output_dir,
         )
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
