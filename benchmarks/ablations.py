@@ -206,10 +206,12 @@ The planners of [`small`](results.md), and what one change makes of them. (`lead
 its symbols learn the demonstrations by heart: valid plans fall from 93 of 100 in the middle to 68 in the end.)
 
 What helps is more demonstrations; or, with the same ones, `observation_noise`, by which starts look alike that differ
-by less than about two centimetres while the plan is decided. At the end of the training, 93 of 100 plans are valid
-with it, with more weight decay, too, 98, with that alone 87, and without either 81 to 89 (three seeds). It has been
-tried in this task alone, with one seed, at one size, and for no other planner, so that no preset has it. (These three
-were trained in float32, the others in bfloat16, which made waypoints and poses coarser than it does now.)
+by less than about two centimetres while the plan is decided. At the end of the training, 93 and 99 of 100 plans are
+valid with it (two seeds), with more weight decay, too, 98, with that alone 87, and without either 81 to 89 (three
+seeds). It does not help Separate: 68 of 100 plans are valid with it, and 67 to 76 without (three seeds). It has been
+tried in this task alone and at one size, so that no preset has it. (All that has noise or weight decay was trained in
+float32, the others in bfloat16, which made waypoints and poses coarser than it does now. What that alone does, is not
+measured yet.)
 
 """
 ABOUT_DIFFUSER = """

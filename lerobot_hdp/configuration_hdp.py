@@ -2,6 +2,7 @@
 
 import logging
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -249,7 +250,8 @@ class HDPConfig(PreTrainedConfig):
             _check_choice("pretrained_backbone_weights", self.pretrained_backbone_weights, choices)
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
         if self.dtype == "bfloat16" and not bfloat16_is_fast(self.device):
-            logging.warning("This CPU has no bfloat16 instructions: computing in float32, which is faster")
+            message = "this CPU has no bfloat16 instructions: computing in float32, which is faster"
+            warnings.warn(message, stacklevel=3)  # of whoever made the configuration, above the dataclass's own code
             self.dtype = "float32"
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")

@@ -75,7 +75,7 @@ class SymbolicPlanProcessorStep(ObservationProcessorStep):
         vocabulary_size: m.
 
     Raises:
-        ValueError: a plan that is empty or too long, or holds what is no integer or, on a CPU, no symbol's token id.
+        ValueError: a plan that is empty, too long or, on a CPU, holds a token id that is no symbol's.
     """
 
     symbolic_horizon: int | None = None
@@ -85,10 +85,7 @@ class SymbolicPlanProcessorStep(ObservationProcessorStep):
         plan = observation.pop(OBS_SYMBOLIC_PLAN, None)
         if plan is None or self.symbolic_horizon is None:
             return observation
-        plan = torch.as_tensor(plan)
-        if plan.is_floating_point():
-            raise ValueError(f"{OBS_SYMBOLIC_PLAN} must hold token ids, which are integers, got {plan.dtype}")
-        plan = plan.long()
+        plan = torch.as_tensor(plan).long()  # LeRobot hands what an environment observes over as floats
         if plan.ndim == 1:  # one sample; or a batch of plans of one token, which LeRobot stores as numbers
             plan = plan.unsqueeze(1 if self.symbolic_horizon == 1 else 0)
         if not 0 < plan.shape[1] <= self.symbolic_horizon:
