@@ -5,7 +5,6 @@ MUJOCO_GL=egl python -m benchmarks.clips CHECKPOINT --prompt "... STACK red"   #
 """
 
 import argparse
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -17,6 +16,7 @@ from PIL import Image
 from dataset_tools.demonstration import PlanStep, expert_generator
 from dataset_tools.experts import EXPERTS
 from gym_hdp_tasks.task import PlanningTask
+from lerobot_hdp.plan import plan_rows
 
 from .evaluation import load, make_plans
 from .pages import DOCS
@@ -91,8 +91,8 @@ def film_planner(checkpoint: Path, prompt: str | None, seed: int) -> None:
 
 def plan_steps(symbols: list[str], task: PlanningTask) -> tuple[PlanStep, ...]:
     """The steps of a symbolic plan, at the time that all demonstrations of the task keep."""
-    ends = pairwise([(0, 0), *task.step_ends])
-    return tuple(PlanStep(tuple(symbols[first:end]), stop) for (first, _), (end, stop) in ends if symbols[first:end])
+    rows = plan_rows(len(symbols), task.horizon, task.step_ends)
+    return tuple(PlanStep(tuple(symbols[row.tokens]), row.waypoints.stop) for row in rows if row.waypoints)
 
 
 def main() -> None:

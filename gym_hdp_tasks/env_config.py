@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from .task import CAMERAS, OBS_TYPES, RENDER_MODES, ROBOTS, PlanningTask, parse_camera_names
+from .task import CAMERAS, OBS_TYPES, RENDER_MODES, ROBOTS, PlanningTask, check_image_size, parse_camera_names
 
 TASKS = {
     "BlockSorting2D-v0": "gym_hdp_tasks.block_sorting_2d:block_sorting_2d_task",
@@ -62,6 +62,7 @@ class HDPEnv(EnvConfig):
         try:
             task = self.planning_task
             cameras = parse_camera_names(self.camera_name)
+            check_image_size(self.observation_height, self.observation_width)
         except ValueError as error:  # LeRobot's commands show the message of draccus' own error only
             raise ParsingError(str(error)) from error
         for name, choices in (("robot", ROBOTS), ("obs_type", OBS_TYPES), ("render_mode", RENDER_MODES)):
@@ -76,11 +77,6 @@ class HDPEnv(EnvConfig):
                 raise ParsingError(f"--env.{field.name} must be left out, {self.task} does not have it")
             if field.name in IMAGES_ONLY and self.obs_type == "state":
                 raise ParsingError(f"--env.{field.name} is of images: add --env.obs_type=pixels, or pixels_state")
-        if min(self.observation_height, self.observation_width) < 1:
-            raise ParsingError(
-                "--env.observation_height and --env.observation_width must be at least 1 pixel, got "
-                f"{self.observation_height} and {self.observation_width}"
-            )
         if self.fps not in (EnvConfig.fps, task.fps):
             raise ParsingError(f"--env.fps must be left out, it is {task.fps} for {self.task}")
         self.fps = task.fps

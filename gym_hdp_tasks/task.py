@@ -73,6 +73,19 @@ def parse_camera_names(camera_name: str | Sequence[str]) -> tuple[str, ...]:
     return names
 
 
+def check_image_size(observation_height: int, observation_width: int) -> None:
+    """Whether observed images can have a size, in pixels.
+
+    Raises:
+        ValueError: they cannot.
+    """
+    if min(observation_height, observation_width) < 1:
+        raise ValueError(
+            "observation_height and observation_width must be at least 1 pixel, got "
+            f"{observation_height} and {observation_width}"
+        )
+
+
 def draw_order(generator: np.random.Generator, n_blocks: int, options: Mapping[str, Any]) -> np.ndarray:
     """Which block starts in which slot of a sorting task: a random order, but never the sorted one.
 

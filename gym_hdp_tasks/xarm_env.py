@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from .scene import BLOCK_HALF_SIZE, FRONT_CAMERA_FOVY, furnish
-from .task import CAMERAS, FRONT_CAMERA, OBS_TYPES, RENDER_MODES, PlanningTask, parse_camera_names
+from .task import CAMERAS, FRONT_CAMERA, OBS_TYPES, RENDER_MODES, PlanningTask, check_image_size, parse_camera_names
 from .waypoint_motion import WaypointMotion
 from .xarm7 import ARM_JOINTS, GRIPPERS, ROBOT_CONTYPE, TCP_SITE, robot_spec
 
@@ -82,11 +82,7 @@ class XArmEnv(gym.Env):
     ):
         if obs_type not in OBS_TYPES:
             raise ValueError(f"obs_type must be one of {OBS_TYPES}, got {obs_type!r}")
-        if min(observation_height, observation_width) < 1:
-            raise ValueError(
-                f"observation_height and observation_width are at least 1 pixel, got {observation_height} x "
-                f"{observation_width}"
-            )
+        check_image_size(observation_height, observation_width)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         self.planning_task = planning_task

@@ -216,8 +216,7 @@ def plan_rows(num_tokens: int, horizon: int, step_ends: StepEnds | None = None) 
         return [PlanRow(slice(start, min(start + TOKENS_PER_ROW, num_tokens)), None) for start in starts]
     rows = []
     for (start, first), (stop, end) in pairwise([(0, 0), *step_ends, (num_tokens, 0)]):
-        waypoints = slice(first, min(end, horizon))
-        if start < min(stop, num_tokens):
-            has_waypoints = waypoints.start < waypoints.stop
-            rows.append(PlanRow(slice(start, min(stop, num_tokens)), waypoints if has_waypoints else None))
+        stop, end = min(stop, num_tokens), min(end, horizon)
+        if start < stop:
+            rows.append(PlanRow(slice(start, stop), slice(first, end) if first < end else None))
     return rows

@@ -41,8 +41,6 @@ class TrainingNoise:
 
     def corrupt(self, process: Process, clean: Tensor, level: Tensor) -> Corrupted:
         """Corrupt (B, H, ...) clean data to levels (B,)."""
-        if self.world_size == 1:
-            return process.corrupt(clean, level, self.generator)
         of_all = process.corrupt(self._for_all(clean), self._for_all(level), self.generator)
         return Corrupted(*(self._own_part(part) for part in (of_all.value, of_all.target, of_all.level)))
 
