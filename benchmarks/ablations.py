@@ -134,6 +134,7 @@ TODAYS = {
     "observation_noise=0.02, optimizer_weight_decay=0.3": Variant(
         "small", {"observation_noise": 0.02, "optimizer_weight_decay": 0.3}
     ),
+    "observation_noise=0.02, steps=2x": Variant("small", {"observation_noise": 0.02}, steps=2),
     "separate_diffuser": Variant("small", method="separate_diffuser"),
     "separate_diffuser, demonstrations=4x": Variant("small", method="separate_diffuser", demonstrations=4),
     "separate_diffuser, observation_noise=0.02": Variant("small", {"observation_noise": 0.02}, "separate_diffuser"),
