@@ -211,8 +211,8 @@ by less than about two centimetres while the plan is decided. At the end of the 
 valid with it (two seeds), with more weight decay, too, 98, with that alone 87, and without either 81 to 89 (three
 seeds). It does not help Separate: 68 of 100 plans are valid with it, and 67 to 76 without (three seeds). It has been
 tried in this task alone and at one size, so that no preset has it. (All that has noise or weight decay was trained in
-float32, the others in bfloat16, which made waypoints and poses coarser than it does now. What that alone does, is not
-measured yet.)
+float32, the others in bfloat16, which made waypoints and poses coarser than it does now. `dtype=float32` is that alone:
+it gains nothing, and 86 of 100 plans are valid with it.)
 
 """
 ABOUT_DIFFUSER = """
