@@ -136,7 +136,8 @@ class HDPConfig(PreTrainedConfig):
         symbol_lead: share of the network calls in which the symbols are denoised beside a motion that is still pure
             noise. Without a lead, few steps let the motion choose a plan of its own before the symbols have made
             up theirs. There is none where a part of the motion is given, or all symbols of a whole batch.
-        num_inference_steps: network calls for a plan; N where the preset says nothing else.
+        num_inference_steps: network calls for a plan (of HD and CHD for each level); N where the preset says nothing
+            else.
         prompt: a part of every plan, in words (prompt.py, docs/conditioning.md). None: what the environment asks for.
         num_candidates: plans that are drawn for each observation, of which the most likely is executed.
 

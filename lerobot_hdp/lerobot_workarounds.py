@@ -23,7 +23,9 @@ def read_metadata(source: "DatasetConfig") -> "LeRobotDatasetMetadata":
     from lerobot.datasets import LeRobotDatasetMetadata  # not where the plugin is only discovered
 
     try:
-        return LeRobotDatasetMetadata(source.repo_id, root=source.root, revision=source.revision)
+        return LeRobotDatasetMetadata(
+            source.repo_id, root=source.root, revision=source.revision, repo_type=source.repo_type
+        )
     except (OSError, HTTPError) as error:
         where = "in LeRobot's cache" if source.root is None else f"in {source.root}"
         raise ValueError(

@@ -28,8 +28,8 @@ def describe_planner(card: ModelCard, config: HDPConfig, fps: int | None, env: E
     where = config.repo_id or "<repository>"
     lines = [
         SUMMARIES.get(config.type, f"A planner of type `{config.type}`."),
-        f"From one observation it plans {config.horizon} actions, in {config.num_inference_steps} network calls. "
-        + _say_what_is_executed(config, fps),
+        f"From one observation it plans {config.horizon} actions, in {config.num_inference_steps} network "
+        f"calls{' of each level' if config.type in ('hd', 'chd') else ''}. " + _say_what_is_executed(config, fps),
         "LeRobot knows this policy when the plugin `lerobot_policy_hdp` is installed.",
     ]
     if config.symbol_process is not None:

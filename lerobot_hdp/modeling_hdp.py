@@ -1,15 +1,19 @@
 """The planner as a LeRobot policy."""
 
+import json
 import logging
 import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial, wraps
+from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 import torch
 from huggingface_hub import ModelCard
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import NormalizationMode
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -37,6 +41,8 @@ from .vocabulary import FREE, PAD_ID, Vocabulary
 
 POSE_NOISE_POWER = 3
 """Of the share of noise in the motion's variance: how fast `observation_noise` falls as the motion becomes clear."""
+MEANING_OF_WEIGHTS = ("prediction_type", "rotary", "num_heads")
+"""Settings that weights of the same shapes are nothing without: with another, they make plans that look like plans."""
 CONDITION = "condition_tokens"
 """Where a batch holds its encoded observations, (B, n, width), while a plan is made from it."""
 
@@ -563,7 +569,16 @@ class HDPPolicy(PreTrainedPolicy):
 
     @classmethod
     def _load_as_safetensor(cls, model: "HDPPolicy", model_file: str, map_location: str, strict: bool) -> "HDPPolicy":
-        """Load the whole checkpoint or none of it: half-loaded weights plan nonsense without a word."""
+        """Load the whole checkpoint or none of it, as what it was: else it plans nonsense without a word."""
+        settings = Path(model_file).with_name(CONFIG_NAME)
+        saved = json.loads(settings.read_text()) if settings.exists() else {}
+        for name in MEANING_OF_WEIGHTS:
+            wanted = getattr(model.config, name)
+            if (learned := saved.get(name, wanted)) != wanted:
+                raise ValueError(
+                    f"{name}={wanted} does not fit the weights in {model_file}, which have learned with {learned}: "
+                    "leave it out, or train anew"
+                )
         try:
             return super()._load_as_safetensor(model, model_file, map_location, strict=True)
         except FileNotFoundError as error:
@@ -619,7 +634,11 @@ def _pose_noise(config: HDPConfig, stats: dict[str, Any]) -> Tensor:
 
 
 def _check_statistics(config: HDPConfig, stats: dict[str, Any]) -> None:
-    """Whether all that is normalised can be: LeRobot would leave the rest as it is, without a word."""
+    """Whether all that is normalised can be, which LeRobot would leave as it is without a word, and plans hold symbols.
+
+    Raises:
+        ValueError: they say otherwise.
+    """
     for key, feature in {**config.input_features, **config.output_features}.items():
         mode = config.normalization_mapping.get(feature.type.value, NormalizationMode.IDENTITY)
         if mode is not NormalizationMode.IDENTITY and key not in stats:
@@ -627,6 +646,21 @@ def _check_statistics(config: HDPConfig, stats: dict[str, Any]) -> None:
                 f"there are no statistics of {key}, to normalise it by. Where --rename_map renames it, train with "
                 "hdp-train; where it was added to the dataset, first run lerobot-edit-dataset "
                 "--operation.type=recompute_stats"
+            )
+        for name in ("min", "max", "mean", "std") if mode is not NormalizationMode.IDENTITY else ():
+            unknown = np.flatnonzero(~np.isfinite(np.asarray(stats[key][name])))
+            if len(unknown):
+                raise ValueError(
+                    f"the {name} of {key} in the dataset is NaN or infinite, in components {unknown.tolist()}: mend "
+                    "its frames, then run lerobot-edit-dataset --operation.type=recompute_stats"
+                )
+    if config.symbol_process is not None and OBS_SYMBOLIC_PLAN in stats:
+        plans = stats[OBS_SYMBOLIC_PLAN]
+        low, high = int(np.min(plans["min"])), int(np.max(plans["max"]))
+        if low < PAD_ID or high >= len(config.vocabulary or []):
+            raise ValueError(
+                f"{OBS_SYMBOLIC_PLAN} holds token ids from {low} to {high}, but the symbols are 0 to "
+                f"{len(config.vocabulary or []) - 1}: what follows a plan is {PAD_ID}"
             )
 
 

@@ -26,7 +26,8 @@ class PlanPrompt:
 
     Attributes:
         token_ids: (B, H_d) int64 token ids, FREE (-1) where the planner decides, FREE_SYMBOL (-2) where it decides
-            among the symbols other than PAD (with the masked process; others may draw PAD). None: all symbols are free.
+            among the symbols other than PAD (with the masked process; others may draw PAD). FREE before a given PAD is
+            a plan that ends there or earlier. None: all symbols are free.
         actions: (B, H_c, D) normalised actions. None: the whole motion is free.
         actions_given: (B, H_c) bool, which of `actions` are given. None: all of them.
     """
@@ -49,8 +50,8 @@ class PlanPrompt:
         """(B, H_d) bool, where no PAD is to be drawn, which only fills the end of a plan; None: it may be anywhere."""
         if self.token_ids is None:
             return None
-        given_from_here_on = (self.token_ids >= PAD_ID).flip(1).cummax(dim=1).values.flip(1)
-        return given_from_here_on | (self.token_ids == FREE_SYMBOL)
+        symbol_from_here_on = (self.token_ids > PAD_ID).flip(1).cummax(dim=1).values.flip(1)
+        return symbol_from_here_on | (self.token_ids == FREE_SYMBOL)
 
     @property
     def actions_mask(self) -> Tensor | None:

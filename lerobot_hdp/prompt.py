@@ -208,9 +208,10 @@ def _token_id(word: str, where: str, vocabulary: Vocabulary) -> int | None:
 def _placements(parts: Sequence[Part], length: int) -> Iterator[tuple[int, ...]]:
     """Rows of token ids, one for each way to place the parts; some may come twice."""
     says_the_end = any(part.start is not None and part.start < 0 for part in parts)
+    is_symbol = says_the_end or any(part.ends for part in parts)  # what comes before the end, wherever nothing is said
     for plan_length in range(1, length + 1) if says_the_end else (length,):
         for starts in _starts(parts, plan_length):
-            row = [FREE_SYMBOL if says_the_end else FREE] * plan_length + [PAD_ID] * (length - plan_length)
+            row = [FREE_SYMBOL if is_symbol else FREE] * plan_length + [PAD_ID] * (length - plan_length)
             for part, start in zip(parts, starts, strict=True):
                 stop = start + len(part.ids)
                 row[start:stop] = part.ids

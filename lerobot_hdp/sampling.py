@@ -96,7 +96,7 @@ def sample_plan(
 
     What the prompt gives stays fixed at every step. Given tokens are seen clean; a given action (or one-hot symbol)
     is seen with the noise of the current level, as in training. Where all symbols or the whole motion of a sample are
-    given, its k_d or k_c is 0, unless the two share one level. PAD fills the end of a plan only: before a given token,
+    given, its k_d or k_c is 0, unless the two share one level. PAD fills the end of a plan only: before a given symbol,
     the masked process draws none.
 
     Args:
@@ -170,7 +170,8 @@ def _steps_ahead(prompt: PlanPrompt, symbol_lead: float, num_steps: int) -> int:
     None where they have something to follow, a part of the motion that pure noise would hide, or, in the whole batch,
     nothing to decide.
     """
-    if prompt.actions is not None or (prompt.tokens_mask is not None and bool(prompt.tokens_mask.all())):
+    gives_motion = prompt.actions_mask is not None and bool(prompt.actions_mask.any())
+    if gives_motion or (prompt.tokens_mask is not None and bool(prompt.tokens_mask.all())):
         return 0
     return int(symbol_lead * num_steps)
 

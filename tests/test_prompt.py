@@ -60,6 +60,7 @@ def test_where_the_words_of_a_prompt_may_stand(prompt, expected):
 def test_where_the_plan_has_not_ended_only_pad_is_excluded():
     assert encode_prompt("DRAG _", VOCABULARY, LENGTH).tolist() == [[4, FREE_SYMBOL, FREE, FREE, FREE, FREE]]
     assert encode_prompt("-6:DRAG", VOCABULARY, LENGTH).tolist() == [[4] + [FREE_SYMBOL] * 5]
+    assert encode_prompt("5:PAD", VOCABULARY, LENGTH).tolist() == [[FREE_SYMBOL] * 4 + [PAD_ID] * 2]
 
 
 @pytest.mark.parametrize(

@@ -188,14 +188,16 @@ PLANNER_FLAGS = ("--policy.type=hdp", "--policy.horizon=145", "--policy.num_laye
     [
         (lerobot_train, (*DIFFUSION_FLAGS, "--policy.horizon=16", "--policy.n_action_steps=8")),
         (hdp_train, PLANNER_FLAGS),
+        (hdp_train, (*PLANNER_FLAGS, "--max_memory_gib=0", "--num_workers=1")),
     ],
-    ids=["diffusion", "hdp"],
+    ids=["diffusion", "hdp", "hdp, read by a worker"],
 )
 def test_lerobot_trains_its_own_diffusion_policy_on_it_and_hdp_train_the_planner(
     dataset, tmp_path, script, policy_flags
 ):
     log = call_command(
         script.main,
+        "--num_workers=0",
         *policy_flags,
         "--policy.push_to_hub=false",
         "--policy.device=cpu",
@@ -206,7 +208,6 @@ def test_lerobot_trains_its_own_diffusion_policy_on_it_and_hdp_train_the_planner
         "--batch_size=2",
         "--steps=2",
         "--log_freq=1",
-        "--num_workers=0",
     )
     assert "step:2" in log
     weights = load_file(tmp_path / "run/checkpoints/last/pretrained_model/model.safetensors")

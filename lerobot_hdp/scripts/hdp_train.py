@@ -28,6 +28,7 @@ from lerobot.configs import FeatureType
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.scripts import lerobot_train
+from lerobot.utils.collate import lerobot_collate_fn
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch.distributed import ProcessGroup
 from torch.utils.data import Dataset, Subset
@@ -76,14 +77,13 @@ class Replacements:
         self.users_num_workers: int | None = None
         self.process_group: ProcessGroup | None = None
         self._open = lerobot_train.make_train_eval_datasets
-        self._collate = lerobot_train.lerobot_collate_fn
         self._save = lerobot_train.save_checkpoint
         self._should_save = lerobot_train.should_save_checkpoint
         self._update = lerobot_train.update_policy
 
     def install(self) -> None:
         lerobot_train.make_train_eval_datasets = self.make_train_eval_datasets
-        lerobot_train.lerobot_collate_fn = self.lerobot_collate_fn
+        lerobot_train.lerobot_collate_fn = collate
         lerobot_train.save_checkpoint = self.save_checkpoint
         lerobot_train.should_save_checkpoint = self.should_save_checkpoint
         lerobot_train.update_policy = self.update_policy
@@ -132,10 +132,6 @@ class Replacements:
             cfg.num_workers = 0  # there is nothing to wait for; image transforms are made sample by sample
         return InMemoryDataset(train, *options), None if held_out is None else InMemoryDataset(held_out, *options)
 
-    def lerobot_collate_fn(self, samples: list[Any]) -> Any:
-        """Collate a batch with language columns, which one from memory does not need."""
-        return samples[0] if isinstance(samples[0], Batch) else self._collate(samples)
-
     def save_checkpoint(self, *args: Any, cfg: TrainPipelineConfig, **kwargs: Any) -> None:
         """Save the number of workers that the user said, for whoever resumes with lerobot-train."""
         cfg.num_workers = self.users_num_workers
@@ -164,6 +160,11 @@ class Replacements:
             ValueError: always.
         """
         raise ValueError(f"hdp-train trains on this machine: with --job.target={cfg.job.target}, use lerobot-train")
+
+
+def collate(samples: list[Any]) -> Any:
+    """Collate a batch with language columns, which one from memory does not need; data-loader workers get it, too."""
+    return samples[0] if isinstance(samples[0], Batch) else lerobot_collate_fn(samples)
 
 
 def _first_frames(dataset: Dataset) -> Subset:
