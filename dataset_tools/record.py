@@ -394,6 +394,8 @@ def _record(config: RecordConfig) -> LeRobotDataset:
                 record_shard(config, shard, progress)
         else:
             context = multiprocessing.get_context("forkserver")
+            # Workers import the rest themselves: MuJoCo opens a display when it is imported.
+            context.set_forkserver_preload(["lerobot.datasets.lerobot_dataset"])
             with ProcessPoolExecutor(config.num_workers, context, initializer=end_with_parent) as executor:
                 futures = {executor.submit(record_shard, config, shard): shard for shard in shards}
                 try:

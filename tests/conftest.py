@@ -1,6 +1,7 @@
 """What several test files share: a recorded dataset, and a policy made for it."""
 
 import contextlib
+import functools
 import inspect
 import io
 import logging
@@ -17,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from draccus.wrappers import docstring
 from huggingface_hub import constants
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.parser import get_cli_overrides  # noqa: F401 (imports LeRobot once, before the timers of pytest)
@@ -28,10 +30,14 @@ from lerobot.scripts import lerobot_train
 import lerobot_policy_hdp  # noqa: F401 (registers the policy and the environments)
 from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import sort_blocks_2d
+from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
+from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp import HDPConfig
 from lerobot_hdp.denoiser import Denoiser
 from lerobot_hdp.modeling_hdp import HDPPolicy
 
+# draccus reads the sources of all configurations anew, for the texts of --help, whenever a command parses its flags.
+docstring._contains_attribute_definition = functools.cache(docstring._contains_attribute_definition)
 torch.set_num_threads(1)  # as in the commands that tests run: weights are compared
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore Ctrl-C, which tests send
 
@@ -85,15 +91,10 @@ def call_command(main: Callable[[], None], *arguments) -> str:
 
 @pytest.fixture(scope="session")
 def dataset_root(tmp_path_factory) -> Path:
-    """A dataset of two-block sorting, recorded by the real command."""
+    """A dataset of two-block sorting."""
     root = tmp_path_factory.mktemp("datasets") / "sorting"
-    run_command(
-        "hdp-record",
-        *TASK_FLAGS,
-        "--dataset.repo_id=test/sorting",
-        f"--dataset.root={root}",
-        f"--dataset.num_episodes={N_EPISODES}",
-    )
+    env = HDPEnv(task="BlockSorting2D-v0", n_blocks=2, waypoints_per_pose=1)
+    record(RecordConfig(RecordDatasetConfig("test/sorting", root, N_EPISODES), env))
     return root
 
 
@@ -237,12 +238,12 @@ def trained(dataset) -> Trained:
 
     tokens = torch.stack([policy.vocabulary.encode(plan, SYMBOLIC_HORIZON) for plan in seen.plans])
     data = preprocessor({**seen.batch, "observation.symbolic_plan": tokens})
-    keys, steps, peak_lr = [*seen.batch, "observation.symbolic_plan"], 400, 3e-3
+    keys, steps, peak_lr = [*seen.batch, "observation.symbolic_plan"], 300, 3e-3
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, peak_lr, steps, pct_start=0.1, cycle_momentum=False)
     policy.train()
     for _ in range(steps):
-        chosen = torch.randint(len(tokens), (64,))
+        chosen = torch.randint(len(tokens), (48,))
         policy.forward({key: data[key][chosen] for key in keys})[0].backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         optimizer.step()

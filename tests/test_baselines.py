@@ -180,7 +180,7 @@ class TestContract:
 
     def test_it_plans_what_it_has_learned(self, make_planner, batch, training_batch, planner):
         policy, preprocessor, _ = make_planner(planner, ema_max_decay=0)
-        train_in_process(policy, preprocessor(training_batch(policy)), steps=600 if planner == "chd" else 300)
+        train_in_process(policy, preprocessor(training_batch(policy)), steps={"chd": 500, "hd": 250}.get(planner, 200))
         inputs = preprocessor(batch)
         plan = policy.eval().plan(observation(inputs)).actions
         right, wrong = ((plan - inputs["action"].roll(shift, dims=0)).square().mean() for shift in (0, 1))

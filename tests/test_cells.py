@@ -105,24 +105,27 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(finished):
     assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
 
 
-@pytest.mark.parametrize("moment", ["_evaluate", "result_of"])
-def test_a_failure_after_the_training_costs_no_training(finished, monkeypatch, moment):
-    failing, function, calls = replace(finished, name="failing"), getattr(cells, moment), []
+def test_failures_after_the_training_cost_no_training(finished, monkeypatch):
+    """At the second of three evaluations, and when the result is written."""
+    failing = replace(finished, name="failing")
+    for name, failing_call in (("_evaluate", 2), ("result_of", 1)):
+        function, calls = getattr(cells, name), []
 
-    def fail_once(*arguments: Any) -> Any:
-        calls.append(arguments)
-        if len(calls) == (2 if moment == "_evaluate" else 1):
-            raise OSError("no space left on device")
-        return function(*arguments)
+        def fail_once(*arguments: Any, function=function, calls=calls, failing_call=failing_call) -> Any:
+            calls.append(arguments)
+            if len(calls) == failing_call:
+                raise OSError("no space left on device")
+            return function(*arguments)
 
-    monkeypatch.setattr(cells, moment, fail_once)
-    with pytest.raises(OSError, match="no space"):
-        run_cell(failing)
-    assert failing.state() == "trained, not yet evaluated"
-    monkeypatch.setattr(cells, "start_training", None)
+        monkeypatch.setattr(cells, name, fail_once)
+    for _ in range(2):
+        with pytest.raises(OSError, match="no space"):
+            run_cell(failing)
+        assert failing.state() == "trained, not yet evaluated"
+        monkeypatch.setattr(cells, "start_training", None)
     run_cell(failing)
     assert curve(failing) == curve(finished)
-    assert len(content(failing)["earlier_runs"]) == 1
+    assert len(content(failing)["earlier_runs"]) == 2
 
 
 def test_killing_the_benchmark_ends_the_training(cell, tmp_path):

@@ -77,15 +77,14 @@ def test_all_symbols_given(trained):
     assert rate(done(trained, plan), plans) >= RATE
 
 
-@pytest.mark.parametrize("block", ["A", "B"])
 @pytest.mark.parametrize(
     ("prompt", "position"), [("PICK {}", 1), ("... {} _", 16), ("... place {} _ PAD", 16), ("11:{}", 10)]
 )
-def test_a_part_of_the_symbols_given(trained, prompt, position, block):
-    """Where a plan ends is not said: it has 18 symbols, and room for 20."""
-    plan = trained.policy.plan(trained.inputs, prompt.format(block))
+def test_a_part_of_the_symbols_given(trained, prompt, position):
+    """Of each plan another one. Where a plan ends is not said: it has 18 symbols, and room for 20."""
+    plan = trained.policy.plan(trained.inputs, [prompt.format(block) for block in "AB" * 20])
     words = [plan.symbols(i) for i in range(40)]
-    assert all(symbols[position] == block for symbols in words)
+    assert [symbols[position] for symbols in words] == ["A", "B"] * 20
     assert rate([len(symbols) for symbols in words], [18] * 40) >= RATE
     assert rate(done(trained, plan), words) >= RATE
 
@@ -96,9 +95,9 @@ def test_the_motion_given(trained):
     assert rate([plan.symbols(i) for i in range(40)], trained.unseen.plans) >= RATE
 
 
-@pytest.mark.parametrize("waypoints", [4, 7, 13])
+@pytest.mark.parametrize("waypoints", [4, 13])
 def test_the_beginning_of_the_motion_given(trained, waypoints):
-    """4: the first block is grasped; 7 and 13: one or two of three moves are done."""
+    """4: the first block is grasped; 13: two of three moves are done."""
     given = torch.zeros(trained.actions.shape[:2], dtype=torch.bool)
     given[:, :waypoints] = True
     plan = trained.policy.plan(trained.inputs, PlanPrompt(actions=trained.actions, actions_given=given))
@@ -106,12 +105,6 @@ def test_the_beginning_of_the_motion_given(trained, waypoints):
     words = [plan.symbols(i) for i in range(40)]
     assert rate(words, trained.unseen.plans) >= RATE
     assert rate(done(trained, plan), words) >= RATE
-
-
-def test_a_prompt_of_each_sample(trained):
-    prompts = [f"PICK {'AB'[i % 2]}" for i in range(40)]
-    plan = trained.policy.plan(trained.inputs, prompts)
-    assert [plan.symbols(i)[1] for i in range(40)] == ["A", "B"] * 20
 
 
 class TestCandidates:

@@ -323,7 +323,7 @@ def test_a_run_that_is_out_of_time_leaves_a_checkpoint_and_goes_on_from_it(datas
     config = run / "checkpoints/last/pretrained_model/train_config.json"
     assert f"To go on: hdp-train --resume=true --config_path={config} " in log
     assert [path.name for path in (run / "checkpoints").iterdir() if not path.is_symlink()] == ["000001"]
-    run_command("hdp-train", f"--config_path={config}", "--resume=true", "--max_train_minutes=60")
+    call_command(hdp_train.main, f"--config_path={config}", "--resume=true", "--max_train_minutes=60")
     assert_same_weights(weights(run), weights(lerobot_train_run[1]))
 
 

@@ -139,11 +139,13 @@ def test_recordings_from_different_seeds_can_be_merged(tmp_path):
         load_recording(merged)
 
 
-def test_the_result_does_not_depend_on_the_number_of_processes(dataset_root, tmp_path):
+def test_the_command_records_the_same_dataset_with_two_processes(dataset_root, tmp_path):
     root = tmp_path / "two_workers"
     flags = ("--dataset.repo_id=test/sorting", f"--dataset.root={root}", f"--dataset.num_episodes={N_EPISODES}")
     run_command("hdp-record", "--env.type=hdp", *TASK_FLAGS, *flags, "--num_workers=2")
     assert_same_dataset(dataset_root, root)
+    for file in (RECORDING_PATH, "meta/info.json"):
+        assert json.loads((root / file).read_text()) == json.loads((dataset_root / file).read_text())
 
 
 def test_a_cluster_engine_records_the_same_dataset(dataset_root, tmp_path):
@@ -195,19 +197,23 @@ def flags_of(num_episodes: int, root: Path) -> tuple[str, ...]:
     return (*TASK_FLAGS, "--dataset.repo_id=t/t", f"--dataset.root={root}", f"--dataset.num_episodes={num_episodes}")
 
 
+INTERRUPTED = 40
+"""Episodes of a recording that is long enough to be interrupted: eight shards of five."""
+
+
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("datasets") / "uninterrupted"
-    record(config_of(80, root))
+    record(config_of(INTERRUPTED, root))
     return root
 
 
 @pytest.mark.parametrize(
     ("signal_number", "num_workers"),
-    [(signal.SIGTERM, 1), (signal.SIGKILL, 1), (signal.SIGTERM, 2), (signal.SIGKILL, 2), (signal.SIGINT, 2)],
+    [(signal.SIGKILL, 1), (signal.SIGKILL, 2), (signal.SIGINT, 2)],
 )
 def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_path, signal_number, num_workers):
-    config, flags = config_of(80, tmp_path / "stopped"), flags_of(80, tmp_path / "stopped")
+    config, flags = config_of(INTERRUPTED, tmp_path / "stopped"), flags_of(INTERRUPTED, tmp_path / "stopped")
     command = [Path(sys.executable).with_name("hdp-record"), *flags, f"--num_workers={num_workers}"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     first_shard_done = tmp_path / "stopped.partial" / "episodes_000000.done"
@@ -226,14 +232,14 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(uninterrupted, tmp_pa
     shards = [done.with_suffix("") for done in first_shard_done.parent.glob("*.done")]
     if signal_number != signal.SIGKILL:
         assert {path for path in first_shard_done.parent.iterdir() if path.is_dir()} == set(shards), "a shard is lost"
-    assert load_info(first_shard_done.with_suffix("")).total_episodes == 10
-    assert sum(load_info(shard).total_episodes for shard in shards) < 80
+    assert load_info(first_shard_done.with_suffix("")).total_episodes == 5
+    assert sum(load_info(shard).total_episodes for shard in shards) < INTERRUPTED
 
     with pytest.raises(FileExistsError, match="--resume=true"):
         record(config)
     record(replace(config, resume=True))
     assert_same_dataset(tmp_path / "stopped", uninterrupted)
-    assert json.loads((config.root / RECORDING_PATH).read_text())["num_episodes"] == 80
+    assert json.loads((config.root / RECORDING_PATH).read_text())["num_episodes"] == INTERRUPTED
     assert not config.partial_root.exists()
 
 
@@ -327,23 +333,27 @@ def test_an_interrupted_recording_goes_on_with_the_same_settings_only(tmp_path):
             record(replace(other, resume=True))
 
 
-def test_ctrl_c_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("signal_number", "exception"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
+)
+def test_a_signal_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch, signal_number, exception):
     monkeypatch.setattr(recorder, "FEWEST_SHARDS", 1)
-    config = RecordConfig(
-        dataset=RecordDatasetConfig(repo_id="test/stopped", root=tmp_path / "stopped", num_episodes=5),
-        env=HDPEnv(n_blocks=2, waypoints_per_pose=1),
-    )
-    save_episode = LeRobotDataset.save_episode
+    config, save_episode = config_of(5, tmp_path / "stopped"), LeRobotDataset.save_episode
 
-    def save_while_ctrl_c_is_pressed(dataset):
+    def save_while_the_signal_comes(dataset):
         if dataset.meta.total_episodes == 2:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal_number)
         save_episode(dataset)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(LeRobotDataset, "save_episode", save_while_ctrl_c_is_pressed)
-        with pytest.raises(KeyboardInterrupt):
-            record(config)
+    handler = signal.getsignal(signal.SIGTERM)
+    recorder.exit_when_terminated()
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(LeRobotDataset, "save_episode", save_while_the_signal_comes)
+            with pytest.raises(exception):
+                record(config)
+    finally:
+        signal.signal(signal.SIGTERM, handler)
     assert load_info(tmp_path / "stopped.partial/episodes_000000").total_episodes == 3
     assert record(replace(config, resume=True)).num_episodes == 5
 
