@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from accelerate.state import AcceleratorState
 from draccus.wrappers import docstring
 from huggingface_hub import constants
 from lerobot.configs import PreTrainedConfig
@@ -175,6 +176,14 @@ def train_in_process(policy, inputs, steps: int) -> list[dict[str, float]]:
         optimizer.zero_grad()
         history.append(parts)
     return history
+
+
+@pytest.fixture
+def accelerate_begins_anew():
+    """Before and after a test that computes in another precision: Accelerate keeps a process' first one."""
+    AcceleratorState._reset_state(reset_partial_state=True)
+    yield
+    AcceleratorState._reset_state(reset_partial_state=True)
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,6 @@ import pkgutil
 import shutil
 
 import pytest
-from accelerate.state import AcceleratorState
 
 import benchmarks
 from benchmarks import conditioning, planner_report, task_pages, training_step
@@ -84,16 +83,14 @@ def test_a_benchmark_runs(name, arguments, tmp_path, monkeypatch, capsys):
     assert all(page.stat().st_size > 500 for page in tmp_path.glob("*.md"))
 
 
-def test_a_training_that_is_timed_is_known_after_each_round(dataset_root, tmp_path, monkeypatch, capsys):
+def test_a_training_that_is_timed_is_known_after_each_round(
+    dataset_root, accelerate_begins_anew, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(training_step, "FILE", tmp_path / "steps.json")
     size = ["--horizon=19", "--symbolic_horizon=18", "--num_layers=1", "--width=16", "--batch_size=4"]
     chosen = ["--device=cpu", "--settings", "float32", "Muon", "--steps=1", "--rounds=2"]
     monkeypatch.setattr("sys.argv", ["training_step", f"--root={dataset_root}", *size, *chosen])
-    AcceleratorState._reset_state(reset_partial_state=True)  # the benchmark has bfloat16 in it, other tests have not
-    try:
-        training_step.main()
-    finally:
-        AcceleratorState._reset_state(reset_partial_state=True)
+    training_step.main()
     said = capsys.readouterr().out
     assert said.index("1 of 2 rounds: float32") < said.index("2 of 2 rounds: float32")
     result = json.loads(training_step.FILE.read_text())["result"]

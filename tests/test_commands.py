@@ -330,6 +330,22 @@ def test_hdp_plan_executes_a_plan_that_is_shorter_than_the_episode(make_planner,
     assert "executed: 7 actions, after which the episode goes on" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("planner", ["diffuser", "joint_diffuser", "separate_diffuser", "hd", "chd"])
+def test_hdp_plan_takes_every_planner(make_planner, planner, tmp_path, capsys):
+    for saved in make_planner(planner):
+        saved.save_pretrained(tmp_path / "policy")
+    flags = (f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'plan'}", "--env.type=hdp", *TASK_FLAGS)
+    call_command(hdp_plan.main, *flags, f"--html={tmp_path / 'plan.html'}")
+    said = capsys.readouterr().out
+    models_symbols = planner in ("joint_diffuser", "separate_diffuser")
+    assert ("checked: " in said) == models_symbols
+    assert "executed: score" in said
+    assert (tmp_path / "plan.html").stat().st_size > 10_000
+    if not models_symbols:
+        with pytest.raises(SystemExit, match="this planner models no symbols"):
+            call_command(hdp_plan.main, *flags, "--prompt=PICK B")
+
+
 def test_hdp_plan_takes_a_planner_without_its_training_configuration(checkpoint, tmp_path, capsys):
     """As `policy.push_to_hub` uploads it."""
     policy = tmp_path / "policy"

@@ -327,6 +327,22 @@ def test_a_run_that_is_out_of_time_leaves_a_checkpoint_and_goes_on_from_it(datas
     assert_same_weights(weights(run), weights(lerobot_train_run[1]))
 
 
+def test_a_training_in_bfloat16_goes_on_where_it_stopped(
+    dataset_root, lerobot_train_run, accelerate_begins_anew, tmp_path, monkeypatch
+):
+    """On a CPU that has instructions for it, or not. The weights stay float32."""
+    monkeypatch.setattr("lerobot_hdp.configuration_hdp.bfloat16_is_fast", lambda _: True)
+    run = tmp_path / "run"
+    train(hdp_train.main, dataset_root, run, PLANNER_FLAGS, "--policy.dtype=bfloat16", "--save_freq=3")
+    expected, in_float32 = weights(run), weights(lerobot_train_run[1])
+    trained = [name for name in expected if name.startswith("planner.")]
+    assert all(expected[name].dtype == torch.float32 for name in trained)
+    assert not any(torch.equal(expected[name], in_float32[name]) for name in trained)
+    config = run / "checkpoints/000003/pretrained_model/train_config.json"
+    call_command(hdp_train.main, f"--config_path={config}", "--resume=true")
+    assert_same_weights(weights(run), expected)
+
+
 def test_the_held_out_loss_is_that_of_whole_plans(dataset_root, tmp_path):
     flags = (*PLANNER_FLAGS, f"--eval_steps={STEPS}", "--dataset.eval_split=0.2")
     with pytest.warns(UserWarning, match="eval_loss says nothing of this planner"):
