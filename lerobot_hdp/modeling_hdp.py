@@ -648,7 +648,7 @@ def _check_statistics(config: HDPConfig, stats: dict[str, Any]) -> None:
                 "--operation.type=recompute_stats"
             )
         for name in ("min", "max", "mean", "std") if mode is not NormalizationMode.IDENTITY else ():
-            unknown = np.flatnonzero(~np.isfinite(np.asarray(stats[key][name])))
+            unknown = np.flatnonzero(~np.isfinite(np.asarray(stats[key].get(name, 0.0))))
             if len(unknown):
                 raise ValueError(
                     f"the {name} of {key} in the dataset is NaN or infinite, in components {unknown.tolist()}: mend "
