@@ -143,6 +143,7 @@ class HDPPolicy(PreTrainedPolicy):
         config.validate_features()
         if dataset_stats is not None:
             _check_statistics(config, dataset_stats)
+            _check_token_ids(config, dataset_stats)
             if config.pretrained_path is not None:
                 widen_narrow_ranges(config, dataset_stats)
         if config.num_candidates > 1:
@@ -634,34 +635,36 @@ def _pose_noise(config: HDPConfig, stats: dict[str, Any]) -> Tensor:
 
 
 def _check_statistics(config: HDPConfig, stats: dict[str, Any]) -> None:
-    """Whether all that is normalised can be, which LeRobot would leave as it is without a word, and plans hold symbols.
-
-    Raises:
-        ValueError: they say otherwise.
-    """
+    """Whether all that is normalised can be: LeRobot would leave the rest as it is, without a word."""
     for key, feature in {**config.input_features, **config.output_features}.items():
-        mode = config.normalization_mapping.get(feature.type.value, NormalizationMode.IDENTITY)
-        if mode is not NormalizationMode.IDENTITY and key not in stats:
+        if config.normalization_mapping.get(feature.type.value) in (None, NormalizationMode.IDENTITY):
+            continue
+        if key not in stats:
             raise ValueError(
                 f"there are no statistics of {key}, to normalise it by. Where --rename_map renames it, train with "
                 "hdp-train; where it was added to the dataset, first run lerobot-edit-dataset "
                 "--operation.type=recompute_stats"
             )
-        for name in ("min", "max", "mean", "std") if mode is not NormalizationMode.IDENTITY else ():
+        for name in ("min", "max", "mean", "std"):
             unknown = np.flatnonzero(~np.isfinite(np.asarray(stats[key].get(name, 0.0))))
             if len(unknown):
                 raise ValueError(
                     f"the {name} of {key} in the dataset is NaN or infinite, in components {unknown.tolist()}: mend "
                     "its frames, then run lerobot-edit-dataset --operation.type=recompute_stats"
                 )
-    if config.symbol_process is not None and OBS_SYMBOLIC_PLAN in stats:
-        plans = stats[OBS_SYMBOLIC_PLAN]
-        low, high = int(np.min(plans["min"])), int(np.max(plans["max"]))
-        if low < PAD_ID or high >= len(config.vocabulary or []):
-            raise ValueError(
-                f"{OBS_SYMBOLIC_PLAN} holds token ids from {low} to {high}, but the symbols are 0 to "
-                f"{len(config.vocabulary or []) - 1}: what follows a plan is {PAD_ID}"
-            )
+
+
+def _check_token_ids(config: HDPConfig, stats: dict[str, Any]) -> None:
+    """Whether the dataset's plans hold symbols alone, as far as its statistics say."""
+    if config.symbol_process is None or OBS_SYMBOLIC_PLAN not in stats:
+        return
+    plans, last = stats[OBS_SYMBOLIC_PLAN], len(config.vocabulary) - 1
+    low, high = int(np.min(plans["min"])), int(np.max(plans["max"]))
+    if low < PAD_ID or high > last:
+        raise ValueError(
+            f"{OBS_SYMBOLIC_PLAN} holds token ids from {low} to {high}, but the symbols are 0 to {last}: what follows "
+            f"a plan is {PAD_ID}"
+        )
 
 
 def _check_episodes_fit(config: HDPConfig, lengths: Sequence[int]) -> None:
