@@ -58,7 +58,8 @@ class Cell:
         policy: its `type` and options, as under `policy` in a train config.
         steps, batch_size, seed: of the training.
         evaluations: at regular intervals of the training, the last one at its end.
-        starts: fresh starts of an evaluation: the same for all cells of a task, others at each evaluation.
+        starts: fresh starts of an evaluation: the same for all cells of a task that have as many, others at each
+            evaluation.
         average_last: evaluations at the end whose mean is the cell's figure.
         facts: what a report needs to know beside these.
     """
@@ -309,7 +310,7 @@ def run_cell(cell: Cell, threads: int = 1, deadline: Deadline | None = None, tra
                 return f"{cell.name}: {cell.state()}, no time left"
             train(cell, threads, deadline, train_flags)
         else:
-            note_run(cell)
+            note_run(cell, threads)
         evaluate_checkpoints(cell, threads, deadline)
         progress = Progress.load(cell)
         if [point["step"] for point in progress.curve][-1:] != [cell.steps]:
@@ -357,14 +358,14 @@ def start_training(cell: Cell, threads: int, deadline: Deadline, train_flags: Se
     arguments += train_flags
     if deadline.seconds_left < math.inf:
         arguments.append(f"--max_train_minutes={deadline.seconds_left / 60:.3f}")
-    note_run(cell)
+    note_run(cell, threads)
     return _start(cell.folder / "train.log", threads, _hdp_train, arguments, train_s)
 
 
-def note_run(cell: Cell) -> None:
+def note_run(cell: Cell, threads: int) -> None:
     """Add this run to those that a cell's figures come from."""
     progress = Progress.load(cell)
-    progress.runs.append(describe_run())
+    progress.runs.append({**describe_run(), "threads": threads})
     progress.save(cell)
 
 
@@ -431,6 +432,7 @@ def result_of(cell: Cell, progress: Progress) -> dict[str, Any]:
         **cell.facts,
         "planner": cell.policy["type"],
         **cell.settings,
+        "computed_in": policy.config.dtype,
         "parameters": num_parameters(policy),
         "network_calls_per_plan": policy.config.num_inference_steps,
         "train_s": round(train_s, 1),

@@ -18,7 +18,7 @@ from lerobot.envs import preprocess_observation
 from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 
 import lerobot_policy_hdp  # noqa: F401 (registers the policies and the tasks)
-from gym_hdp_tasks.block_sorting_2d import block_name
+from gym_hdp_tasks.block_sorting_2d import CLOSED_BELOW, block_name
 from gym_hdp_tasks.open_loop import execute_plans
 from gym_hdp_tasks.xarm_env import XArmEnv
 from lerobot_hdp import PlanPrompt
@@ -29,7 +29,8 @@ MISTAKES = ("missed", "lost", "misplaced")
 """How a motion fails: the gripper closes on nothing; what it holds slips out; or it takes or sets down something in a
 wrong place."""
 GRIPS_BELOW, EMPTY_BELOW = 0.1, 0.15
-"""A gripper that is told to close to less than the first, and closes to less than the second, holds nothing."""
+"""A gripper of the X-Arm that is told to close to less than the first, and closes to less than the second, holds
+nothing."""
 Outcome = dict[str, Any]
 """`is_success`, and what else is known of an executed plan."""
 
@@ -166,13 +167,13 @@ def first_mistake(env: gym.Env, motion: np.ndarray, seed: int) -> str:
     """What goes wrong first in a motion that fails, one of `MISTAKES`."""
     env = env.unwrapped
     env.reset(seed=seed)
-    held = False
+    on_arm, held = isinstance(env, XArmEnv), False
     for action in motion:
         env.step(action)
-        if action[-1] >= GRIPS_BELOW:
+        if action[-1] >= (GRIPS_BELOW if on_arm else CLOSED_BELOW):
             held = False
             continue
-        empty = env.gripper_opening() < EMPTY_BELOW if isinstance(env, XArmEnv) else env.held is None
+        empty = env.gripper_opening() < EMPTY_BELOW if on_arm else env.held is None
         if empty:
             return "lost" if held else "missed"
         held = True

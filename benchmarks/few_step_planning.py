@@ -47,8 +47,9 @@ Success in % of fresh starts (95 % interval), over the network calls for a plan.
   too few then.
 
 Each section names what made it, as the command was at that commit (today, ways of two words are quoted, `--ways ddpm
-'symbols lead'`, and `--samplers` is gone); of the checkpoints, those in `checkpoints/` were kept. Set
-`--policy.sampler`, `--policy.confidence_threshold`, `--policy.symbol_lead` and `--policy.num_inference_steps`.
+'symbols lead'`, `--samplers` is gone, and `confidence`, where the column has 0.8, meant that threshold); of the
+checkpoints, those in `checkpoints/` were kept. Set `--policy.sampler`,
+`--policy.confidence_threshold`, `--policy.symbol_lead` and `--policy.num_inference_steps`.
 
 """
 

@@ -27,8 +27,8 @@ PAGE = DOCS / "plan_variety.md"
 PREAMBLE = """# How many different plans
 
 In tool use, the demonstrations choose one of 36 plans uniformly, whatever the start. A planner that has learned this
-makes about 35 of them in as many starts: the effective number is the exponential of the entropy of the plans' shares,
-and less means that it prefers some. (More means that it also makes invalid ones.)
+makes about 35 of them in the 1,000 starts of the table: the effective number is the exponential of the entropy of the
+plans' shares, and less means that it prefers some. (More means that it also makes invalid ones.)
 
 Revealing what the planner is surest of prefers plans that are a little more probable, most of all where symbols lead
 and decide alone. That is part of what makes plans in few calls valid. Where variety counts, set

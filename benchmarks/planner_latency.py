@@ -77,7 +77,7 @@ def describe(content: dict) -> str:
     header, rows = ["planner", "parameters", "over Diffuser"], []
     for size in sizes:
         header += [f"batch {size}, ms", "over Diffuser"]
-    for name in METHODS:
+    for name in (method for method in METHODS if method in result["parameters"]):
         cells = [f"`{name}`", f"{result['parameters'][name]:,}", f"{result['parameter_ratio'][name] - 1:+.1%}"]
         for measured in sizes.values():
             for low, middle, high in (measured[name]["ms"], measured[name]["ratio"]):

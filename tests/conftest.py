@@ -127,14 +127,17 @@ def batch(dataset):
     return torch.utils.data.default_collate(items)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def training_batch(dataset):
     """Training samples of four episodes, in the windows that a policy asks LeRobot for: `training_batch(policy)`."""
+    batches = {}
 
     def load(policy):
         windows = resolve_delta_timestamps(policy.config, dataset.meta)
-        windowed = LeRobotDataset("test/sorting", root=dataset.root, delta_timestamps=windows, video_backend="pyav")
-        return torch.utils.data.default_collate([windowed[episode * HORIZON] for episode in range(4)])
+        if (asked := repr(windows)) not in batches:
+            windowed = LeRobotDataset("test/sorting", root=dataset.root, delta_timestamps=windows, video_backend="pyav")
+            batches[asked] = torch.utils.data.default_collate([windowed[episode * HORIZON] for episode in range(4)])
+        return {key: value.clone() if torch.is_tensor(value) else value for key, value in batches[asked].items()}
 
     return load
 

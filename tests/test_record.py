@@ -487,16 +487,9 @@ def test_bad_flags_are_one_line_and_leave_nothing_behind(tmp_path, monkeypatch, 
     monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
     with pytest.raises(SystemExit) as end:
         recorder.main()
+    assert end.value.code.startswith("hdp-record: ")
     assert message in end.value.code
     assert "\n" not in end.value.code
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_bad_flag_ends_the_command_with_an_error(tmp_path):
-    flags = ("--dataset.repo_id=t/t", f"--dataset.root={tmp_path / 'nothing'}", "--env.n_blocks=1")
-    result = run_command("hdp-record", *flags, check=False)
-    assert result.returncode == 1
-    assert result.stderr.splitlines() == ["hdp-record: n_blocks must be in [2, 8], got 1"]
     assert list(tmp_path.iterdir()) == []
 
 

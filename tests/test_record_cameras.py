@@ -111,10 +111,7 @@ def test_neither_the_number_of_processes_nor_an_interruption_changes_a_frame(tmp
             np.testing.assert_array_equal(one[key], other[key], err_msg=key)
 
 
-@pytest.mark.parametrize("env", [SORTING, ARRANGE], ids=["videos", "no cameras"])
-def test_replaying_the_actions_from_the_seed_gives_the_recorded_score(dataset, tmp_path, env):
-    if env is ARRANGE:
-        dataset = record(config(tmp_path / "state", HDPEnv(task=ARRANGE.task), num_episodes=3))
+def test_replaying_the_actions_from_the_seed_gives_the_recorded_score(dataset):
     recording = load_recording(dataset)
     assert replay(recording) == recording.scores.tolist() == [1.0] * dataset.num_episodes
     never_open = recording._replace(plans=recording.plans * [1, 1, 1, 0])

@@ -72,7 +72,7 @@ def test_other_columns_are_copied_without_loss(tmp_path):
 @pytest.mark.parametrize("video", [True, False])
 def test_cameras_are_thinned_out_too(tmp_path, video):
     size = {"observation_height": 48, "observation_width": 64}
-    env = HDPEnv(task="XArmSorting-v0", obs_type="pixels", camera_name="front", **size)
+    env = HDPEnv(task="XArmArrangeBlocks-v0", obs_type="pixels", camera_name="front", **size)
     config = RecordDatasetConfig("test/images", tmp_path / "images", num_episodes=1, video=video, language=True)
     dataset = record(RecordConfig(config, env))
     as_in_training = LeRobotDataset(

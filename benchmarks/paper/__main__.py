@@ -53,6 +53,8 @@ def main() -> None:
     presets = options.presets or (list(PRESETS) if options.list else ["default"])
     chosen = presets, options.tasks, options.methods, options.seeds
     cells = packed_cells() if options.packed else make_cells(*chosen)
+    if not cells:
+        parser.error("no preset that is chosen has such a task, or the method cannot do it")
     if options.list:
         for cell in cells:
             print(f"{cell.group.removeprefix('paper/') + '/' + cell.name:60} {cell.state()}")

@@ -109,7 +109,7 @@ PRESETS: dict[str, Preset] = {
         },
         starts=50,
     ),
-    # `default` with a network of a tenth of the size, and as much training as a CPU core carries in half an hour.
+    # `default` with a network of a seventh of the size, and as much training as a CPU core carries in half an hour.
     "small": Preset(
         policy={"preset": "default", "dtype": "bfloat16", **_SMALL_LR, **_MINI_XARM},
         tasks={

@@ -67,8 +67,9 @@ def write_report(page: Path = DOCS / "results.md") -> list[Path]:
         "## The simulation table\n",
         "Each cell gives the mean score and, in parentheses, its standard deviation over seeds and over the last "
         "checkpoints, as in the paper. With two seeds, the mean of each follows; from three on, the 95 % interval of "
-        "the mean (Student's t). Last comes success: how often the whole task was solved. The tasks are built after "
-        "the paper's description, in our own simulation: its figures stand beside ours for orientation. "
+        "the mean (Student's t): of further trainings, because all seeds share their demonstrations. Last comes "
+        "success: how often the whole task was solved. The tasks are built after the "
+        "paper's description, in our own simulation: its figures stand beside ours for orientation. "
         f"{floor(XARM_TASKS)}\n",
         "All settings were chosen by HDP's success, and then used for all planners, but for what only masked symbols "
         "or HDP have: `symbol_lead`, `confidence_threshold` and, in arranging, `lead_share`. [How fair that "
@@ -124,7 +125,8 @@ def simulation(preset: str, titles: dict[str, str], results: Results) -> str:
         row = [LABELS[method]]
         for task in titles:
             if task in published.SCORES:
-                row.append("{} % ({} %)".format(*published.SCORES[task][method]))
+                theirs = published.SCORES[task].get(method)
+                row.append("{} % ({} %)".format(*theirs) if theirs else "")
             row.append(score(results.get((preset, task, method))))
         rows.append(row)
     settings = PRESETS[preset]
@@ -287,7 +289,7 @@ def latency() -> str:
     for content in contents:
         device = planner_latency.device_name(content)
         for size, measured in content["result"]["batch_size"].items():
-            ratios = {method: measured[method]["ratio"][1] for method in METHODS}
+            ratios = {method: measured[method]["ratio"][1] for method in METHODS if method in measured}
             columns[f"{device}, batch {size}"] = {name: f"{100 * (ratio - 1):+.0f} %" for name, ratio in ratios.items()}
     rows = [[LABELS[method], *(column.get(method, "") for column in columns.values())] for method in METHODS]
     return (
@@ -318,7 +320,8 @@ def training_time(results: Results) -> str:
 
 def _cpu(run: dict[str, Any]) -> str:
     instructions = f" with {run['cpu_capability']}" if "cpu_capability" in run else ""
-    return f"{run['cpu']}{instructions}, {run['cores']} cores"
+    threads = f", {run['threads']} threads" if run.get("threads", 1) > 1 else ""
+    return f"{run['cpu']}{instructions}, {run['cores']} cores{threads}"
 
 
 def failures(results: Results) -> str:
