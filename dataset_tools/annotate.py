@@ -12,7 +12,6 @@ Example:
 
 import shutil
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +20,13 @@ from lerobot.datasets.dataset_tools import add_features
 from lerobot.utils.constants import ACTION
 
 from gym_hdp_tasks import PAD
+from lerobot_hdp.lerobot_workarounds import shorten_torchcodec_warning
 from lerobot_hdp.vocabulary import Vocabulary
 
-from .demonstration import Demonstration, PlanStep
+from .demonstration import Demonstration, PlanStep, check_steps
 from .language import SYMBOLIC_PLAN
+
+shorten_torchcodec_warning()
 
 
 def add_symbolic_plans(
@@ -33,10 +35,9 @@ def add_symbolic_plans(
     repo_id: str,
     root: Path | str,
     vocabulary: Sequence[str] | None = None,
+    symbolic_horizon: int | None = None,
 ) -> LeRobotDataset:
     """Copy a dataset, with what remains of the plan at each frame in the column `observation.symbolic_plan`.
-
-    A plan is as long as the longest.
 
     Args:
         dataset: to be copied, with all its episodes.
@@ -45,12 +46,14 @@ def add_symbolic_plans(
         root: its folder.
         vocabulary: all symbols that its plans may have, PAD first; for a planner that is trained on with it, the
             planner's. None: PAD and the symbols of these plans, in alphabetical order.
+        symbolic_horizon: tokens of a plan, which PAD fills up. None: as many as the longest has. Datasets that are to
+            be merged need the same vocabulary and the same symbolic horizon.
 
     Raises:
         FileExistsError: the folder exists.
         ValueError: there is not one plan for each episode, no plan has a step, a step has the word PAD or one that the
-            vocabulary lacks, a word cannot be a symbol, or the steps of an episode are not done one after the other,
-            between its first frame and its end.
+            vocabulary lacks, a word cannot be a symbol, a plan is longer than the symbolic horizon, or the steps of an
+            episode are not done one after the other, between its first frame and its end.
     """
     if Path(root).exists():
         raise FileExistsError(f"{root} exists already: delete it, or choose another folder")
@@ -58,21 +61,15 @@ def add_symbolic_plans(
         raise ValueError(f"there are {len(plans)} plans for {dataset.meta.total_episodes} episodes")
     lengths = dataset.meta.episodes["length"]
     for episode, (plan, length) in enumerate(zip(plans, lengths, strict=True)):
-        stops = [step.stop for step in plan]
-        if any(stop <= earlier for earlier, stop in pairwise([0, *stops])) or max(stops, default=0) > length:
-            raise ValueError(f"the stops of episode {episode} must strictly increase within 1..{length}, got {stops}")
-        if texts := [step.symbols for step in plan if isinstance(step.symbols, str)]:
-            raise ValueError(f"a step of episode {episode} is the text {texts[0]!r} instead of a tuple of words")
+        check_steps(plan, length, f"episode {episode}")
         if any(PAD in step.symbols for step in plan):
             raise ValueError(f"a step of episode {episode} has the word {PAD}, which only fills plans up")
     symbols = {symbol for plan in plans for step in plan for symbol in step.symbols}
     vocabulary = [PAD, *sorted(symbols)] if vocabulary is None else list(vocabulary)
     Vocabulary(vocabulary)  # whether its words can be symbols
-    if unknown := symbols.difference(vocabulary):
-        raise ValueError(f"the vocabulary {' '.join(vocabulary)} has no {', '.join(sorted(unknown))}")
-    symbolic_horizon = max(sum(len(step.symbols) for step in plan) for plan in plans)
-    if symbolic_horizon == 0:
+    if not symbols:
         raise ValueError("no plan has a step: there is nothing to learn")
+    symbolic_horizon = symbolic_horizon or max(sum(len(step.symbols) for step in plan) for plan in plans)
     token_ids = []
     for plan, length in zip(plans, lengths, strict=True):
         demonstration = Demonstration(np.empty((length, *dataset.meta.shapes[ACTION])), tuple(plan))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -37,9 +38,36 @@ class Demonstration:
         return [symbol for step in self.steps if step.stop > frame for symbol in step.symbols]
 
     def remaining_token_ids(self, frame: int, vocabulary: Sequence[str], symbolic_horizon: int) -> np.ndarray:
-        """The same as token ids, positions in the vocabulary, filled with 0 (PAD): (symbolic_horizon,) int64."""
-        ids = [vocabulary.index(symbol) for symbol in self.remaining_symbols(frame)]
+        """The same as token ids, positions in the vocabulary, filled with 0 (PAD): (symbolic_horizon,) int64.
+
+        Raises:
+            ValueError: a symbol is not in the vocabulary, or there are more than symbolic_horizon.
+        """
+        symbols = self.remaining_symbols(frame)
+        if unknown := set(symbols).difference(vocabulary):
+            raise ValueError(f"the vocabulary {' '.join(vocabulary)} has no {', '.join(sorted(unknown))}")
+        if len(symbols) > symbolic_horizon:
+            raise ValueError(f"a plan of {len(symbols)} symbols does not fit a symbolic horizon of {symbolic_horizon}")
+        ids = [vocabulary.index(symbol) for symbol in symbols]
         return np.array(ids + [0] * (symbolic_horizon - len(ids)), dtype=np.int64)
+
+
+def check_steps(steps: Sequence[PlanStep], length: int, whose: str) -> None:
+    """Whether the steps of a plan can be those of an episode.
+
+    Args:
+        steps: in the order of execution.
+        length: frames of the episode.
+        whose: they are, for the error.
+
+    Raises:
+        ValueError: a step is a text, or they are not done one after the other between the first frame and the end.
+    """
+    if texts := [step.symbols for step in steps if isinstance(step.symbols, str)]:
+        raise ValueError(f"a step of {whose} is the text {texts[0]!r} instead of a tuple of words")
+    stops = [step.stop for step in steps]
+    if any(stop <= earlier for earlier, stop in pairwise([0, *stops])) or max(stops, default=0) > length:
+        raise ValueError(f"the stops of {whose} must strictly increase within 1..{length}, got {stops}")
 
 
 Expert = Callable[[gym.Env, np.random.Generator], Demonstration]

@@ -48,7 +48,7 @@ import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from gym_hdp_tasks import PlanningTask
 from gym_hdp_tasks.env_config import HDPEnv
 
-from .demonstration import Expert, expert_generator
+from .demonstration import Expert, check_steps, expert_generator
 from .experts import EXPERTS
 from .interruption import deferred_signals, end_with_parent, exit_when_terminated, one_process
 from .language import SYMBOLIC_PLAN, write_language_columns
@@ -180,13 +180,14 @@ def demonstrate(env: gym.Env, expert: Expert, seed: int, features_map: dict[str,
             the dictionary `pixels`) to the column.
 
     Raises:
-        ValueError: the expert's waypoints are not as many as the task's horizon.
+        ValueError: the expert's waypoints are not as many as the task's horizon, or its plan is none of the task.
     """
     observation, _ = env.reset(seed=seed)
     demonstration = expert(env, expert_generator(seed))
     task: PlanningTask = env.unwrapped.planning_task  # type: ignore[attr-defined]
     if len(demonstration.waypoints) != task.horizon:
         raise ValueError(f"the expert has {len(demonstration.waypoints)} waypoints, {task.gym_id} {task.horizon}")
+    check_steps(demonstration.steps, task.horizon, "the expert's plan")
     frames = []
     for frame, action in enumerate(demonstration.waypoints):
         next_observation, score, terminated, truncated, info = env.step(action)
@@ -370,7 +371,8 @@ def record(config: RecordConfig) -> LeRobotDataset:
 
     Raises:
         FileExistsError: the dataset's folder exists, or an interrupted recording does and `resume` is not set.
-        ValueError: the environment cannot be made, or the interrupted recording had other settings.
+        ValueError: the environment cannot be made, nobody can demonstrate the task, or the interrupted recording had
+            other settings.
         OSError: another process records this dataset, or the upload failed.
     """
     try:
@@ -487,8 +489,11 @@ def try_environment(config: RecordConfig) -> None:
     """Find out whether episodes can start, before there is anything on disk.
 
     Raises:
+        ValueError: nobody can demonstrate the task.
         OSError: images are wanted, and there is nothing to render with.
     """
+    if config.env.gym_id not in EXPERTS:
+        raise ValueError(f"{config.env.gym_id} has no expert in dataset_tools/experts/__init__.py")
     env = gym.make(config.env.gym_id, disable_env_checker=True, **config.env.gym_kwargs)
     try:
         env.reset(seed=0)

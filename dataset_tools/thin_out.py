@@ -16,7 +16,11 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.language import LANGUAGE_COLUMNS
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 
+from lerobot_hdp.lerobot_workarounds import shorten_torchcodec_warning
+
 from .language import SYMBOLIC_PLAN
+
+shorten_torchcodec_warning()
 
 
 def thin_out(dataset: LeRobotDataset, every: int, repo_id: str, root: Path | str) -> LeRobotDataset:

@@ -1,6 +1,8 @@
 """`--env.type=hdp`: LeRobot's view of the tasks."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from inspect import signature
 from pkgutil import resolve_name
 from typing import Any
 
@@ -20,10 +22,11 @@ TASKS = {
 }
 """Task name, as in `--env.task=`, to the function that states the task's facts. It is imported when the task is chosen:
 every command of LeRobot imports this module, also where there is no MuJoCo to be had."""
-BLOCK_SORTING_2D_ONLY = ("n_blocks", "waypoints_per_pose")
+TASK_PARAMETERS = ("n_blocks", "waypoints_per_pose", "robot")
+"""Fields of `HDPEnv` that a task has if the function that states its facts takes them."""
 IMAGES_ONLY = ("camera_name", "observation_height", "observation_width")
-XARM_ONLY = ("robot", "obs_type", *IMAGES_ONLY)
-"""Fields of `HDPEnv` that not every task, or not every kind of observation, has."""
+XARM_ONLY = ("obs_type", *IMAGES_ONLY)
+"""Fields of `HDPEnv` that tasks with a `robot` have; the cameras' mean something where images are observed."""
 
 
 @EnvConfig.register_subclass("hdp")
@@ -69,7 +72,7 @@ class HDPEnv(EnvConfig):
             if getattr(self, name) not in choices:
                 raise ParsingError(f"--env.{name} must be one of {choices}, got {getattr(self, name)!r}")
         self.camera_name = ",".join(cameras)
-        others = BLOCK_SORTING_2D_ONLY if self._is_xarm else XARM_ONLY
+        others = set(TASK_PARAMETERS).difference(self._task_parameters) | set(() if self._has_robot else XARM_ONLY)
         for field in fields(self):
             if getattr(self, field.name) == field.default:
                 continue
@@ -103,19 +106,22 @@ class HDPEnv(EnvConfig):
         Raises:
             ValueError: there is no such task, or it cannot have these parameters.
         """
+        return self._state_facts(**self._task_parameters)
+
+    @property
+    def _state_facts(self) -> Callable[..., PlanningTask]:
         if self.task not in TASKS:
             raise ValueError(f"--env.task={self.task} is not a task of --env.type=hdp; choose one of {list(TASKS)}")
-        return resolve_name(TASKS[self.task])(**self._task_parameters)
+        return resolve_name(TASKS[self.task])
 
     @property
     def _task_parameters(self) -> dict[str, Any]:
-        if self.task == "BlockSorting2D-v0":
-            return {"n_blocks": self.n_blocks, "waypoints_per_pose": self.waypoints_per_pose}
-        return {"robot": self.robot}
+        taken = signature(self._state_facts).parameters
+        return {name: getattr(self, name) for name in TASK_PARAMETERS if name in taken}
 
     @property
-    def _is_xarm(self) -> bool:
-        return self.task != "BlockSorting2D-v0"
+    def _has_robot(self) -> bool:
+        return "robot" in self._task_parameters
 
     @property
     def package_name(self) -> str:
@@ -128,7 +134,7 @@ class HDPEnv(EnvConfig):
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         kwargs = {"render_mode": self.render_mode, **self._task_parameters}
-        if self._is_xarm:
+        if self._has_robot:
             kwargs |= {
                 "obs_type": self.obs_type,
                 "camera_name": self.camera_name,

@@ -145,6 +145,9 @@ class HDPConfig(PreTrainedConfig):
         dtype: `float32`, or `bfloat16` for autocast: of all in training, of the denoiser in planning. A CPU that has no
             instructions for it computes in float32.
 
+        action_feature_names: of the actions' components, read from the dataset: `lerobot-rollout` puts them into the
+            robot's order.
+
         optimizer_type: `muon` updates the matrices between hidden layers by Muon and the rest by AdamW (optimizer.py),
             `adamw` all by AdamW.
         optimizer_*, scheduler_*: of these, with a linear warm-up and a cosine decay to the last step. The preset's
@@ -210,6 +213,7 @@ class HDPConfig(PreTrainedConfig):
     compile_model: bool = False
     compile_mode: str = "default"
     dtype: str = "float32"
+    action_feature_names: list[str] | None = None
 
     optimizer_type: str | None = None
     optimizer_lr: float | None = None
@@ -254,6 +258,8 @@ class HDPConfig(PreTrainedConfig):
             message = "this CPU has no bfloat16 instructions: computing in float32, which is faster"
             warnings.warn(message, stacklevel=3)  # of whoever made the configuration, above the dataclass's own code
             self.dtype = "float32"
+        if self.use_amp:
+            raise ParsingError("use_amp is for policies without a dtype: leave it out, and set dtype=bfloat16")
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
         for name in AT_LEAST_1:
@@ -299,7 +305,8 @@ class HDPConfig(PreTrainedConfig):
                 raise ParsingError(f"what is planned lies in [-1, 1]: normalization_mapping needs {modality}: MIN_MAX")
         if self.num_inference_steps > self.num_train_timesteps:
             raise ParsingError(
-                f"num_inference_steps={self.num_inference_steps} is more than {self.num_train_timesteps=}"
+                f"num_inference_steps={self.num_inference_steps} is more than {self.num_train_timesteps=}, the number "
+                "of noise levels that the weights learn"
             )
         if self.prompt and self.vocabulary and self.symbolic_horizon:
             try:

@@ -41,7 +41,7 @@ from .vocabulary import FREE, PAD_ID, Vocabulary
 
 POSE_NOISE_POWER = 3
 """Of the share of noise in the motion's variance: how fast `observation_noise` falls as the motion becomes clear."""
-MEANING_OF_WEIGHTS = ("prediction_type", "rotary", "num_heads")
+MEANING_OF_WEIGHTS = ("prediction_type", "rotary", "num_heads", "num_train_timesteps")
 """Settings that weights of the same shapes are nothing without: with another, they make plans that look like plans."""
 CONDITION = "condition_tokens"
 """Where a batch holds its encoded observations, (B, n, width), while a plan is made from it."""
@@ -122,9 +122,14 @@ class HDPPolicy(PreTrainedPolicy):
         dataset_meta: metadata of the dataset that the policy is to be trained on; its episodes are checked against
             the horizon. With it, a new policy's image encoders start from `pretrained_backbone_weights`; a checkpoint
             has weights of its own.
-        kwargs: `from_pretrained` hands over what was meant for the configuration, such as `cli_overrides`.
+        cli_overrides: `from_pretrained` hands this over, too: flags that the configuration has read already.
+
+    Attributes:
+        last_plan: what `select_action` and `predict_action_chunk` are executing; None before the first plan, and after
+            `reset`.
 
     Raises:
+        TypeError: `from_pretrained` was given a setting by its name.
         ValueError: the configuration is another planner's, or incomplete, or does not fit the dataset.
     """
 
@@ -133,7 +138,17 @@ class HDPPolicy(PreTrainedPolicy):
     can_score = True
     """Whether it can say how likely a plan is, and so choose among candidates."""
 
-    def __init__(self, config: HDPConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any):
+    def __init__(
+        self,
+        config: HDPConfig,
+        dataset_stats: Any = None,
+        dataset_meta: Any = None,
+        cli_overrides: Sequence[str] = (),
+        **settings: Any,
+    ):
+        if settings:
+            flags = [f"--{name}={value}" for name, value in settings.items()]
+            raise TypeError(f"settings are given to from_pretrained as on a command line: cli_overrides={flags}")
         if config.type != self.name:
             raise ValueError(
                 f"this is a planner of type {config.type}: load it by lerobot.policies.get_policy_class("
@@ -167,7 +182,7 @@ class HDPPolicy(PreTrainedPolicy):
         averages = config.ema_max_decay > 0
         self.ema = MovingAverage(self.planner, config.ema_power, config.ema_max_decay) if averages else None
         if config.compile_model:
-            for network in {self.planner, self._planning_network}:
+            for network in (self.planner, *([self.ema.module] if self.ema else [])):
                 for denoiser in network.denoisers:
                     denoiser.compile(mode=config.compile_mode)
         # Training noise is a function of these two, so that a resumed run goes on exactly as if never interrupted.
@@ -192,11 +207,12 @@ class HDPPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget the plan in execution. To be called on `env.reset()`."""
+        self.last_plan: Plan | None = None
         self._queue: deque[Tensor] = deque()
         self._last_action: Tensor | None = None
 
     def update(self) -> None:
-        """Move the averaged weights. LeRobot calls this after each optimiser step."""
+        """Move the averaged weights, to be called after each optimiser step, as LeRobot does."""
         if self.ema is not None:
             self.ema.update(self.planner)
 
@@ -416,6 +432,11 @@ class HDPPolicy(PreTrainedPolicy):
         for key in self.config.input_features:
             if key not in batch:
                 raise ValueError(f"the planner was trained on {key}, which is not observed here")
+            if batch[key].device.type != self._device.type:
+                raise ValueError(
+                    f"{key} is on {batch[key].device}, the planner on {self._device}: make the preprocessor with "
+                    f'preprocessor_overrides={{"device_processor": {{"device": "{self._device}"}}}}'
+                )
             if not torch.isfinite(batch[key]).all():
                 raise ValueError(f"{key} holds NaN or infinity: no plan can be made from it")
 
@@ -479,20 +500,44 @@ class HDPPolicy(PreTrainedPolicy):
         return denoise
 
     @torch.no_grad()
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
-        """The actions that are executed before the next plan: (B, n_action_steps, D), all H_c where that is None."""
-        return self.plan(batch).actions[:, : self.config.n_action_steps]
+    def predict_action_chunk(
+        self, batch: dict[str, Tensor], prompt: str | Sequence[str] | PlanPrompt | None = None, **kwargs: Any
+    ) -> Tensor:
+        """The actions that are executed before the next plan: (B, n_action_steps, D), all H_c where that is None.
+
+        Args:
+            batch, prompt: see `plan`. The plan stays in `last_plan`; that of one robot is logged in words.
+            kwargs: what LeRobot hands to other policies.
+        """
+        self.last_plan = self.plan(batch, prompt)
+        if self.vocabulary is not None and len(self.last_plan.actions) == 1:
+            logging.info("The plan: %s", " ".join(self.last_plan.symbols()))
+        return self.last_plan.actions[:, : self.config.n_action_steps]
 
     @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **kwargs) -> Tensor:
+    def select_action(
+        self, batch: dict[str, Tensor], prompt: str | Sequence[str] | PlanPrompt | None = None, **kwargs: Any
+    ) -> Tensor:
         """The next action of the plan, after making one if there is none: (B, D).
 
         A planner of whole episodes plans once, and then holds the last action until `reset`.
+
+        Args:
+            batch, prompt: see `plan`. A prompt is read when a plan is made.
+            kwargs: what LeRobot hands to other policies.
+
+        Raises:
+            ValueError: the plan in execution is of another number of environments.
 
         Warns:
             UserWarning: it has come to the end of its plan.
         """
         self.eval()
+        if self.last_plan is not None and len(self.last_plan.actions) != self._batch_size(batch):
+            raise ValueError(
+                f"a plan for {len(self.last_plan.actions)} environments is being executed, and here are "
+                f"{self._batch_size(batch)} observations: call reset() when other episodes begin"
+            )
         if not self._queue and self._last_action is not None and self.config.plans_whole_episodes:
             warnings.warn(
                 f"the plan of {self.config.horizon} actions has ended, and its last one is held: end the episode, and "
@@ -501,14 +546,14 @@ class HDPPolicy(PreTrainedPolicy):
             )
             return self._last_action
         if not self._queue:
-            self._queue.extend(self.predict_action_chunk(batch).unbind(dim=1))
+            self._queue.extend(self.predict_action_chunk(batch, prompt).unbind(dim=1))
         self._last_action = self._queue.popleft()
         return self._last_action
 
     @property
     def _planning_network(self) -> Planner:
-        """The averaged weights, where there are any."""
-        return self.planner if self.ema is None else self.ema.module
+        """The averaged weights, where there are any: a training loop that never calls `update` makes none."""
+        return self.planner if self.ema is None or not self.ema.updates else self.ema.module
 
     @property
     def _device(self) -> torch.device:
@@ -559,9 +604,10 @@ class HDPPolicy(PreTrainedPolicy):
         network, average = f"{prefix}planner.", f"{prefix}ema."
         averaged = {name: value for name, value in state.items() if name.startswith(average)}
         if self.ema is None:
+            begun = bool(averaged) and averaged[f"{average}n_averaged"] > 0
             for name, value in averaged.items():
                 del state[name]
-                if name.startswith(f"{average}module."):
+                if begun and name.startswith(f"{average}module."):
                     state[network + name.removeprefix(f"{average}module.")] = value
         elif not averaged:
             weights = {name.removeprefix(network): value for name, value in state.items() if name.startswith(network)}
@@ -616,6 +662,8 @@ def read_losses(**losses: Tensor) -> dict[str, float]:
 def _one_text_each(prompt: str | Sequence[str], batch_size: int) -> list[str]:
     """A prompt in words for each observation."""
     texts = [prompt] * batch_size if isinstance(prompt, str) else list(prompt)
+    if not all(isinstance(text, str) for text in texts):
+        raise TypeError("a prompt is a string, a list of one for each observation, or a PlanPrompt of token ids")
     if len(texts) != batch_size:
         raise ValueError(f"there are {len(texts)} prompts for {batch_size} observations")
     return texts

@@ -38,14 +38,19 @@ class MovingAverage(nn.Module):
         self.module.eval()
         return self
 
+    @property
+    def updates(self) -> int:
+        """The number of updates; without any, `module` is the network as it was when this was made."""
+        if self._updates is None:
+            self._updates = int(self.n_averaged)
+        return self._updates
+
     @torch.no_grad()
     def update(self, network: nn.Module) -> None:
         """Move towards the network's parameters."""
-        if self._updates is None:
-            self._updates = int(self.n_averaged)
-        decay = min(1 - (1 + self._updates) ** -self.power, self.max_decay)
+        decay = min(1 - (1 + self.updates) ** -self.power, self.max_decay)
         torch._foreach_lerp_(list(self.module.parameters()), list(network.parameters()), 1 - decay)
-        self._updates += 1
+        self._updates = self.updates + 1
         self.n_averaged += 1
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:

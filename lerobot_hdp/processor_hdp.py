@@ -35,7 +35,7 @@ class ObservationShapesProcessorStep(ObservationProcessorStep):
             nothing is said here.
 
     Raises:
-        ValueError: an observation is missing, is no tensor, or has another shape.
+        ValueError: an observation is missing, is no tensor, has another shape, or is an image of whole numbers.
     """
 
     shapes: dict[str, list[int | None]] = field(default_factory=dict)
@@ -47,6 +47,8 @@ class ObservationShapesProcessorStep(ObservationProcessorStep):
             if not isinstance(observation[key], Tensor):
                 kind = type(observation[key]).__name__
                 raise ValueError(f"{key} is a {kind}: make it a torch.Tensor, float32, which LeRobot's processors read")
+            if observation[key].dtype == torch.uint8:
+                raise ValueError(f"{key} is uint8: make it float32 in [0, 1], as image.float() / 255")
             found = list(observation[key].shape[-len(shape) :])
             fits = all(wanted in (None, size) for wanted, size in zip(shape, found, strict=False))
             if shape != [1] and not (fits and len(found) == len(shape)):

@@ -2,14 +2,14 @@
 
 import pytest
 from lerobot.datasets import LeRobotDataset
-from lerobot.datasets.dataset_tools import remove_feature
+from lerobot.datasets.dataset_tools import merge_datasets, remove_feature
 
 from dataset_tools.annotate import add_symbolic_plans
 from dataset_tools.demonstration import PlanStep
 from lerobot_hdp import HDPConfig
 from lerobot_hdp.scripts import hdp_train
 
-from .conftest import HORIZON, call_command
+from .conftest import HORIZON, N_EPISODES, call_command
 
 PICK, PLACE = PlanStep(("PICK", "CUP"), 8), PlanStep(("PLACE", "CUP", "TRAY"), 15)
 
@@ -44,6 +44,22 @@ def test_a_vocabulary_can_be_given(without_plans, tmp_path):
     with_plans = add_symbolic_plans(without_plans, plans, "test/with", tmp_path / "with", vocabulary)
     assert with_plans[0]["observation.symbolic_plan"].tolist() == [1, 3]
     assert with_plans.meta.features["observation.symbolic_plan"]["info"]["vocabulary"] == vocabulary
+
+
+def test_datasets_with_the_same_vocabulary_and_symbolic_horizon_can_be_merged(without_plans, tmp_path):
+    known = {"vocabulary": ["PAD", "PICK", "PLACE", "CUP", "TRAY"], "symbolic_horizon": 6}
+    parts = [
+        add_symbolic_plans(without_plans, [plan] * N_EPISODES, f"test/{name}", tmp_path / name, **known)
+        for name, plan in (("short", [PICK]), ("long", [PICK, PLACE]))
+    ]
+    merged = merge_datasets(parts, output_repo_id="test/merged", output_dir=tmp_path / "merged")
+    first = [merged[episode * HORIZON]["observation.symbolic_plan"].tolist() for episode in (0, N_EPISODES)]
+    assert first == [[1, 3, 0, 0, 0, 0], [1, 3, 2, 3, 4, 0]]
+    with pytest.raises(ValueError, match="a plan of 5 symbols does not fit a symbolic horizon of 4"):
+        add_symbolic_plans(
+            without_plans, [[PICK, PLACE]] * N_EPISODES, "test/with", tmp_path / "with", symbolic_horizon=4
+        )
+    assert not (tmp_path / "with").exists()
 
 
 @pytest.mark.parametrize(

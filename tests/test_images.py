@@ -187,6 +187,7 @@ def test_each_camera_is_a_condition_token_of_its_own(dataset):
 def test_images_are_encoded_once_for_all_candidates(make_planner):
     policy, batch = make_planner()
     seen = []
+    policy.update()
     encoder = policy.ema.module.image_encoder
     encoder.register_forward_hook(lambda module, inputs, outputs: seen.append(len(inputs[0][FRONT])))
     candidates = policy.plan(batch, "... S1", num_candidates=5)
@@ -210,6 +211,8 @@ def test_images_of_any_size_are_resized(dataset):
     assert (of_larger - tokens).norm() < 0.5 * (others - tokens).norm()
     with pytest.raises(ValueError, match="here it has"):
         preprocessor({FRONT: image[:, :1]})
+    with pytest.raises(ValueError, match=r"front is uint8: make it float32 in \[0, 1\]"):
+        preprocessor({FRONT: (255 * image).to(torch.uint8)})
 
 
 def test_pretrained_weights_keep_their_batch_statistics(make_planner, tmp_path, monkeypatch):

@@ -385,6 +385,7 @@ def test_a_planner_saved_without_averaged_weights_can_be_trained_on_with_some(ma
 def test_a_planner_with_averaged_weights_can_be_trained_on_without(make_planner, batch, tmp_path):
     policy, preprocessor, _ = make_planner()
     with torch.no_grad():
+        policy.update()
         for weight in policy.planner.parameters():
             weight += 0.1
     policy.save_pretrained(tmp_path)
@@ -393,6 +394,63 @@ def test_a_planner_with_averaged_weights_can_be_trained_on_without(make_planner,
     inputs = observation(preprocessor(batch))
     plans = [each.plan(inputs, generator=torch.Generator().manual_seed(0)) for each in (policy.eval(), loaded.eval())]
     assert torch.equal(plans[0].actions, plans[1].actions)
+
+
+@pytest.mark.parametrize("ema_max_decay", [0.9999, 0.0])
+def test_a_loop_without_updates_of_the_average_plans_with_what_it_has_trained(
+    make_planner, batch, tmp_path, ema_max_decay
+):
+    """As a loop of one's own, which need not know of `update`; loaded again with and without an average."""
+    policy, preprocessor, _ = make_planner()
+    inputs = preprocessor(batch)
+    before = policy.eval().forward(inputs)[0]
+    train_in_process(policy, inputs, steps=30)
+    policy.save_pretrained(tmp_path)
+    policy.config.ema_max_decay = ema_max_decay
+    loaded = HDPPolicy.from_pretrained(tmp_path, config=policy.config)
+    for each in (policy, loaded):
+        assert each.eval().forward(inputs)[0] < 0.8 * before
+
+
+def test_settings_are_not_given_to_from_pretrained_by_name(make_planner, tmp_path):
+    make_planner()[0].save_pretrained(tmp_path)
+    with pytest.raises(TypeError, match=r"cli_overrides=\['--num_inference_steps=3'\]"):
+        HDPPolicy.from_pretrained(tmp_path, num_inference_steps=3)
+    policy = HDPPolicy.from_pretrained(tmp_path, cli_overrides=["--num_inference_steps=3"])
+    assert policy.config.num_inference_steps == 3
+
+
+def test_the_plan_in_execution_can_be_read_and_prompted(make_planner, batch, caplog):
+    policy, preprocessor, _ = make_planner()
+    inputs = {key: value[:1] for key, value in observation(preprocessor(batch)).items()}
+    assert policy.last_plan is None
+    with caplog.at_level("INFO"):
+        action = policy.select_action(inputs, prompt="PICK B ...")
+    assert torch.equal(action, policy.last_plan.actions[:, 0])
+    words = policy.last_plan.symbols()
+    assert words[:2] == ["PICK", "B"]
+    assert f"The plan: {' '.join(words)}" in caplog.text
+    policy.reset()
+    assert policy.last_plan is None
+
+
+def test_a_plan_is_not_executed_in_other_environments(make_planner, batch):
+    policy, preprocessor, _ = make_planner()
+    inputs = observation(preprocessor(batch))
+    policy.select_action(inputs)
+    fewer = {key: value[:3] for key, value in inputs.items()}
+    with pytest.raises(ValueError, match=r"a plan for 4 environments .* here are 3 observations: call reset"):
+        policy.select_action(fewer)
+    policy.reset()
+    assert policy.select_action(fewer).shape == (3, 3)
+
+
+def test_the_names_of_the_actions_travel_with_the_planner(make_planner, dataset, tmp_path):
+    """`lerobot-rollout` puts a robot's joints into their order."""
+    policy, *_ = make_planner()
+    policy.save_pretrained(tmp_path)
+    loaded = HDPPolicy.from_pretrained(tmp_path)
+    assert loaded.config.action_feature_names == dataset.meta.features["action"]["names"]
 
 
 def test_adapters_are_refused(make_planner):
@@ -405,7 +463,8 @@ def test_a_held_out_loss_depends_on_nothing_but_weights_and_data(make_planner, b
     inputs = preprocessor(batch)
     losses = [policy.eval().forward(inputs)[0].item() for _ in range(2)]
     assert losses[0] == losses[1]
-    torch.nn.init.zeros_(policy.ema.module.denoiser.motion_head.weight)
+    torch.nn.init.zeros_(policy.planner.denoiser.motion_head.weight)
+    policy.update()
     assert policy.forward(inputs)[0].item() != losses[0]
 
 
@@ -451,6 +510,7 @@ def test_training_hides_where_the_objects_are_while_the_motion_does_too(make_pla
         shift = torch.stack([batch[OBS_ENV_STATE] - inputs[OBS_ENV_STATE] for batch in seen]) * half_range
         assert shift.std(dim=(0, 1)).tolist() == pytest.approx([expected] * 4, rel=0.2, abs=1e-4)
         assert all(torch.equal(batch["observation.state"], inputs["observation.state"]) for batch in seen)
+    policy.update()
     policy.ema.module.encoder.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
     policy.eval().forward(inputs)
     assert torch.equal(seen[-1][OBS_ENV_STATE], inputs[OBS_ENV_STATE])
@@ -612,7 +672,9 @@ class TestBadInput:
         with pytest.raises(ValueError, match=r"the settings do not fit the weights in .*decoder\.layers\.1"):
             HDPPolicy.from_pretrained(tmp_path, config=policy.config)
 
-    @pytest.mark.parametrize("override", ["prediction_type=epsilon", "rotary=false", "num_heads=4"])
+    @pytest.mark.parametrize(
+        "override", ["prediction_type=epsilon", "rotary=false", "num_heads=4", "num_train_timesteps=20"]
+    )
     def test_settings_that_give_the_weights_another_meaning(self, make_planner, tmp_path, override):
         make_planner()[0].save_pretrained(tmp_path)
         with pytest.raises(ValueError, match=rf"(?i){override} does not fit the weights in .* learned with"):
@@ -629,6 +691,21 @@ class TestBadInput:
         policy.config.horizon, policy.config.pretrained_path = 18, tmp_path
         with pytest.raises(ValueError, match="horizon is 18: the checkpoint's plans cannot hold them"):
             HDPPolicy(policy.config, dataset_meta=dataset.meta)
+
+    def test_observations_on_another_device(self, make_planner, batch):
+        policy, preprocessor, _ = make_planner()
+        elsewhere = {key: value.to("meta") for key, value in observation(preprocessor(batch)).items()}
+        with pytest.raises(
+            ValueError, match=r"is on meta, the planner on cpu: make the preprocessor with preprocessor_"
+        ):
+            policy.plan(elsewhere)
+
+    def test_a_prompt_of_another_kind(self, make_planner, batch):
+        policy, preprocessor, _ = make_planner()
+        inputs = observation(preprocessor(batch))
+        for prompt in (["PICK A", None, "", ""], torch.zeros(4, 18)):
+            with pytest.raises(TypeError, match="a prompt is a string, a list of one for each observation, or a Plan"):
+                policy.plan(inputs, prompt)
 
     def test_an_observation_that_is_missing(self, make_planner, batch):
         policy, preprocessor, _ = make_planner()
@@ -678,6 +755,7 @@ class TestBadInput:
             {"sampler": "euler"},
             {"plan_from": "middle"},
             {"dtype": "float8"},
+            {"use_amp": True},
             {"n_obs_steps": 2},
             {"width": 30, "num_heads": 4},
             {"width": 2, "num_heads": 1},

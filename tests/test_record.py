@@ -24,6 +24,7 @@ from benchmarks import cells, checkpoints, few_step_planning
 from benchmarks.paper.presets import PRESETS
 from dataset_tools import record as recorder
 from dataset_tools import record_on_cluster as cluster
+from dataset_tools.demonstration import Demonstration
 from dataset_tools.experts import EXPERTS
 from dataset_tools.interruption import one_process
 from dataset_tools.record import (
@@ -448,27 +449,36 @@ def test_failed_demonstrations_are_dropped_and_counted_also_across_an_interrupti
     assert f"dropped {sum(failed.values())} of {10 + sum(failed.values())}" in capsys.readouterr().out
 
 
+def with_step(demonstration: Demonstration, **changes) -> Demonstration:
+    *steps, last = demonstration.steps
+    return replace(demonstration, steps=(*steps, last._replace(**changes)))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda waypoints: np.zeros_like(waypoints), "failed 100 times in a row"),
-        (lambda waypoints: waypoints[:-1], f"{HORIZON - 1} waypoints, hdp/BlockSorting2D-v0 {HORIZON}"),
+        (lambda it: replace(it, waypoints=np.zeros_like(it.waypoints)), "failed 100 times in a row"),
+        (
+            lambda it: replace(it, waypoints=it.waypoints[:-1]),
+            f"{HORIZON - 1} waypoints, hdp/BlockSorting2D-v0 {HORIZON}",
+        ),
+        (lambda it: with_step(it, stop=99), "the stops of the expert's plan must strictly increase within 1..19"),
+        (lambda it: with_step(it, symbols=("PICK", "C")), "the vocabulary PAD A B PICK PLACE S1 S2 AUX has no C"),
+        (lambda it: with_step(it, symbols=("PICK",) * 9), "a plan of 21 symbols does not fit a symbolic horizon of 18"),
     ],
 )
-def test_an_expert_that_does_not_solve_the_task_is_an_error(tmp_path, monkeypatch, change, message):
+def test_an_expert_that_does_not_do_the_task_is_an_error(tmp_path, monkeypatch, change, message):
     expert = EXPERTS["hdp/BlockSorting2D-v0"]
-
-    def useless(env, rng):
-        demonstration = expert(env, rng)
-        return replace(demonstration, waypoints=change(demonstration.waypoints))
-
-    monkeypatch.setitem(EXPERTS, "hdp/BlockSorting2D-v0", useless)
-    config = RecordConfig(
-        dataset=RecordDatasetConfig(repo_id="test/useless", root=tmp_path / "useless", num_episodes=2),
-        env=HDPEnv(n_blocks=2, waypoints_per_pose=1),
-    )
+    monkeypatch.setitem(EXPERTS, "hdp/BlockSorting2D-v0", lambda env, rng: change(expert(env, rng)))
     with pytest.raises(ValueError, match=message):
-        record(config)
+        record(config_of(2, tmp_path / "useless"))
+
+
+def test_a_task_without_an_expert_is_not_recorded(tmp_path, monkeypatch):
+    monkeypatch.delitem(EXPERTS, "hdp/BlockSorting2D-v0")
+    with pytest.raises(ValueError, match="hdp/BlockSorting2D-v0 has no expert in dataset_tools/experts"):
+        record(config_of(2, tmp_path / "useless"))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

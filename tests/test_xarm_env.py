@@ -4,7 +4,7 @@ import copy
 import os
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import gymnasium as gym
 import mujoco
@@ -17,6 +17,7 @@ from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
 import gym_hdp_tasks  # noqa: F401 (registers the tasks)
+from gym_hdp_tasks import PlanningTask, env_config
 from gym_hdp_tasks.env_config import HDPEnv
 from gym_hdp_tasks.task import CAMERAS, OBS_TYPES
 from gym_hdp_tasks.xarm_env import WORKSPACE_HIGH, WORKSPACE_LOW
@@ -228,6 +229,20 @@ def test_a_parameter_that_a_task_does_not_have_is_refused(parameters):
     name = list(parameters)[-1]
     with pytest.raises(ParsingError, match=f"--env.{name} must be left out"):
         HDPEnv(**parameters)
+
+
+def a_task_of_ones_own() -> PlanningTask:
+    """Without an arm, and without anything to choose."""
+    return replace(HDPEnv().planning_task, gym_id="hdp/Toy-v0", parameters={})
+
+
+def test_a_task_has_the_parameters_that_its_facts_depend_on(monkeypatch):
+    monkeypatch.setitem(env_config.TASKS, "Toy-v0", f"{__name__}:a_task_of_ones_own")
+    config = HDPEnv(task="Toy-v0")
+    assert (config.gym_id, config.gym_kwargs) == ("hdp/Toy-v0", {"render_mode": "rgb_array"})
+    for parameter in ({"n_blocks": 4}, {"robot": "menagerie"}, {"obs_type": "pixels"}):
+        with pytest.raises(ParsingError, match="Toy-v0 does not have it"):
+            HDPEnv(task="Toy-v0", **parameter)
 
 
 @pytest.mark.parametrize(
