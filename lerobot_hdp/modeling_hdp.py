@@ -533,9 +533,9 @@ class HDPPolicy(PreTrainedPolicy):
             UserWarning: it has come to the end of its plan.
         """
         self.eval()
-        if self.last_plan is not None and len(self.last_plan.actions) != self._batch_size(batch):
+        if self._last_action is not None and len(self._last_action) != self._batch_size(batch):
             raise ValueError(
-                f"a plan for {len(self.last_plan.actions)} environments is being executed, and here are "
+                f"a plan for {len(self._last_action)} environments is being executed, and here are "
                 f"{self._batch_size(batch)} observations: call reset() when other episodes begin"
             )
         if not self._queue and self._last_action is not None and self.config.plans_whole_episodes:
