@@ -18,10 +18,7 @@ from .cells import FIRST_EVALUATION_SEED, Cell, run_cells
 from .evaluation import evaluate
 from .machine import describe_run
 from .paper.presets import METHODS, make_cells
-from .planner_report import SAMPLERS_FILE, write_page
-
-PRESETS = ("mini", "mini_epsilon")
-TASKS = ("block_sorting_2d_2_blocks", "block_sorting_2d_3_blocks")
+from .planner_report import PRESETS, SAMPLERS_FILE, SEEDS, TASKS, write_page
 
 
 def compare_samplers(cells: list[Cell]) -> None:
@@ -43,7 +40,7 @@ def compare_samplers(cells: list[Cell]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS, choices=SEEDS)
     parser.add_argument("--processes", type=int, default=1, help="cells at a time, which share the cores")
     parser.add_argument("--report", action="store_true")
     parser.add_argument("--samplers", action="store_true")
@@ -53,7 +50,7 @@ def main() -> None:
         compare_samplers(make_cells([PRESETS[0]], [TASKS[1]], METHODS, options.seeds))
     elif not options.report:
         run_cells(cells, options.processes)
-    write_page(cells)
+    write_page()
 
 
 if __name__ == "__main__":

@@ -6,13 +6,16 @@ from collections.abc import Iterable, Sequence
 from statistics import mean
 from typing import Any, NamedTuple
 
-from .cells import Cell, all_runs, points_that_count, read_result
+from .cells import all_runs, points_that_count, read_result
 from .machine import RESULTS
 from .pages import DOCS, LABELS, markdown_table, plot_curves
-from .paper.presets import METHODS
+from .paper.presets import METHODS, make_cells
 
 PAGE, PLOT = DOCS / "planner_comparison.md", DOCS / "images" / "planner_comparison.svg"
 SAMPLERS_FILE = RESULTS / "planner_samplers.json"
+PRESETS = ("mini", "mini_epsilon")
+TASKS = ("block_sorting_2d_2_blocks", "block_sorting_2d_3_blocks")
+SEEDS = (0, 1)
 PREDICTED = {"mini": "the clean motion is predicted", "mini_epsilon": "the noise is predicted"}
 NOTES = {
     "mini_epsilon": " Half the learning rate; the weight of HDP's symbols in its loss is the paper's, Joint's and "
@@ -91,8 +94,9 @@ def samplers_section() -> list[str]:
     ]
 
 
-def write_page(cells: Sequence[Cell]) -> None:
+def write_page() -> None:
     """Write the page and the plot of the cells that are finished."""
+    cells = make_cells(list(PRESETS), list(TASKS), list(METHODS), list(SEEDS))
     panels: dict[Panel, dict[str, list[dict[str, Any]]]] = defaultdict(lambda: defaultdict(list))
     settings, commits = {}, set()
     for cell in sorted(cells, key=lambda cell: METHODS.index(cell.policy["type"])):
@@ -134,4 +138,3 @@ def write_page(cells: Sequence[Cell]) -> None:
         for panel, planners in panels.items()
     }
     plot_curves(curves, PLOT)
-    print(f"{PAGE}\n{PLOT}")
