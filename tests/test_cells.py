@@ -25,6 +25,7 @@ from benchmarks.paper import packing, report
 from benchmarks.paper.packing import CELLS, export, join_files, pack, unpack
 from benchmarks.paper.presets import HIERARCHICAL, METHODS, PRESETS, TASKS, make_cell, make_cells
 from benchmarks.planner_latency import make_planner
+from lerobot_hdp.precision import bfloat16_is_fast
 
 from .conftest import N_EPISODES, REPOSITORY
 
@@ -85,6 +86,12 @@ def test_a_cell_holds_its_learning_curve_and_keeps_its_last_checkpoint(finished)
     assert all(0 <= point["success_rate"] <= point["mean_score"] <= 1 for point in curve(finished))
     assert finished.state() == "finished"
     assert [path.name for path in complete_checkpoints(finished.folder)] == ["000300"]
+    here = "bfloat16" if bfloat16_is_fast("cpu") else "float32"
+    assert (content(finished)["result"]["policy"]["dtype"], content(finished)["result"]["computed_in"]) == (
+        "bfloat16",
+        here,
+    )
+    assert content(finished)["run"]["threads"] == 1
 
 
 def test_a_killed_training_goes_on_as_if_it_had_not_been(finished):

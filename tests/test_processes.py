@@ -95,6 +95,11 @@ class TestGaussianProcess:
         assert levels[-1] == 0
         assert (levels.diff() < 0).all()
 
+    @pytest.mark.parametrize("num_steps", [0, N + 1])
+    def test_there_are_no_more_levels_than_training_steps(self, num_steps):
+        with pytest.raises(ValueError, match=f"a plan takes 1 to 100 network calls, got {num_steps}"):
+            GaussianProcess(N, "sample").levels(num_steps)
+
     def test_training_levels_are_uniform_over_the_steps(self):
         torch.manual_seed(0)
         steps = (GaussianProcess(N, "sample").sample_level(100_000, torch.device("cpu")) * N).round().long()

@@ -88,7 +88,13 @@ class GaussianProcess:
         return self.corrupt(clean, level, generator).value
 
     def levels(self, num_steps: int) -> Tensor:
-        """Evenly spaced training steps."""
+        """Evenly spaced training steps.
+
+        Raises:
+            ValueError: there are not so many.
+        """
+        if not 1 <= num_steps <= self.num_train_timesteps:
+            raise ValueError(f"a plan takes 1 to {self.num_train_timesteps} network calls, got {num_steps}")
         steps = torch.linspace(self.num_train_timesteps, 0, num_steps + 1).round()
         return steps / self.num_train_timesteps
 
