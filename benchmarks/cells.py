@@ -427,12 +427,13 @@ def result_of(cell: Cell, progress: Progress) -> dict[str, Any]:
     """What a results file says about a finished cell."""
     assert cell.last_checkpoint is not None
     policy, *_ = load_policy(cell.last_checkpoint)
+    saved = json.loads((cell.last_checkpoint / "config.json").read_text())  # loaded here, it says what this CPU can do
     train_s = json.loads((cell.last_checkpoint.parent / TRAIN_S).read_text())
     return {
         **cell.facts,
         "planner": cell.policy["type"],
         **cell.settings,
-        "computed_in": policy.config.dtype,
+        "computed_in": saved["dtype"],
         "parameters": num_parameters(policy),
         "network_calls_per_plan": policy.config.num_inference_steps,
         "train_s": round(train_s, 1),

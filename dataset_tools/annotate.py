@@ -69,7 +69,8 @@ def add_symbolic_plans(
     Vocabulary(vocabulary)  # whether its words can be symbols
     if not symbols:
         raise ValueError("no plan has a step: there is nothing to learn")
-    symbolic_horizon = symbolic_horizon or max(sum(len(step.symbols) for step in plan) for plan in plans)
+    if symbolic_horizon is None:
+        symbolic_horizon = max(sum(len(step.symbols) for step in plan) for plan in plans)
     token_ids = []
     for plan, length in zip(plans, lengths, strict=True):
         demonstration = Demonstration(np.empty((length, *dataset.meta.shapes[ACTION])), tuple(plan))

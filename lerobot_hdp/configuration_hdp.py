@@ -259,7 +259,9 @@ class HDPConfig(PreTrainedConfig):
             warnings.warn(message, stacklevel=3)  # of whoever made the configuration, above the dataclass's own code
             self.dtype = "float32"
         if self.use_amp:
-            raise ParsingError("use_amp is for policies without a dtype: leave it out, and set dtype=bfloat16")
+            raise ParsingError(
+                "use_amp is for policies without a dtype: set use_amp=false, and dtype=bfloat16 for speed"
+            )
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
         for name in AT_LEAST_1:

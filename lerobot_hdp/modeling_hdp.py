@@ -148,7 +148,10 @@ class HDPPolicy(PreTrainedPolicy):
     ):
         if settings:
             flags = [f"--{name}={value}" for name, value in settings.items()]
-            raise TypeError(f"settings are given to from_pretrained as on a command line: cli_overrides={flags}")
+            raise TypeError(
+                f"{type(self).__name__} has no argument {next(iter(settings))}; settings are given to from_pretrained "
+                f"as on a command line: cli_overrides={flags}"
+            )
         if config.type != self.name:
             raise ValueError(
                 f"this is a planner of type {config.type}: load it by lerobot.policies.get_policy_class("
@@ -506,11 +509,11 @@ class HDPPolicy(PreTrainedPolicy):
         """The actions that are executed before the next plan: (B, n_action_steps, D), all H_c where that is None.
 
         Args:
-            batch, prompt: see `plan`. The plan stays in `last_plan`; that of one robot is logged in words.
+            batch, prompt: see `plan`. The plan stays in `last_plan`; the whole plan of one robot is logged in words.
             kwargs: what LeRobot hands to other policies.
         """
         self.last_plan = self.plan(batch, prompt)
-        if self.vocabulary is not None and len(self.last_plan.actions) == 1:
+        if self.vocabulary is not None and self.config.plans_whole_episodes and len(self.last_plan.actions) == 1:
             logging.info("The plan: %s", " ".join(self.last_plan.symbols()))
         return self.last_plan.actions[:, : self.config.n_action_steps]
 
@@ -518,12 +521,12 @@ class HDPPolicy(PreTrainedPolicy):
     def select_action(
         self, batch: dict[str, Tensor], prompt: str | Sequence[str] | PlanPrompt | None = None, **kwargs: Any
     ) -> Tensor:
-        """The next action of the plan, after making one if there is none: (B, D).
+        """The next action of the plan, normalised, after making one if there is none: (B, D).
 
         A planner of whole episodes plans once, and then holds the last action until `reset`.
 
         Args:
-            batch, prompt: see `plan`. A prompt is read when a plan is made.
+            batch, prompt: see `plan`. Both are read when a plan is made; the batch says how many robots there are.
             kwargs: what LeRobot hands to other policies.
 
         Raises:
@@ -568,7 +571,10 @@ class HDPPolicy(PreTrainedPolicy):
         return [self._device] if self._device.type == "cuda" else []
 
     def _batch_size(self, batch: dict[str, Tensor]) -> int:
-        return len(batch[CONDITION if CONDITION in batch else next(iter(self.config.input_features))])
+        key = CONDITION if CONDITION in batch else next(iter(self.config.input_features))
+        if key not in batch:
+            raise ValueError(f"the planner was trained on {key}, which is not observed here")
+        return len(batch[key])
 
     def _motion_shape(self, batch: dict[str, Tensor]) -> tuple[int, int, int]:
         """(B, H_c, D)."""

@@ -47,7 +47,7 @@ class ObservationShapesProcessorStep(ObservationProcessorStep):
             if not isinstance(observation[key], Tensor):
                 kind = type(observation[key]).__name__
                 raise ValueError(f"{key} is a {kind}: make it a torch.Tensor, float32, which LeRobot's processors read")
-            if observation[key].dtype == torch.uint8:
+            if len(shape) == len("chw") and observation[key].dtype == torch.uint8:
                 raise ValueError(f"{key} is uint8: make it float32 in [0, 1], as image.float() / 255")
             found = list(observation[key].shape[-len(shape) :])
             fits = all(wanted in (None, size) for wanted, size in zip(shape, found, strict=False))

@@ -22,6 +22,8 @@ def test_a_benchmark_can_be_imported_and_states_its_command(name):
     module = importlib.import_module(f"benchmarks.{name}")
     if hasattr(module, "main"):
         assert f"python -m benchmarks.{name}" in module.__doc__
+    if hasattr(module, "write_page"):
+        assert module.write_page.__module__.removeprefix("benchmarks.") in PAGES
 
 
 @pytest.mark.parametrize("name", PAGES)

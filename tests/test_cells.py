@@ -94,6 +94,16 @@ def test_a_cell_holds_its_learning_curve_and_keeps_its_last_checkpoint(finished)
     assert content(finished)["run"]["threads"] == 1
 
 
+def test_a_cell_says_what_it_was_computed_in_where_it_is_finished_elsewhere(finished):
+    config = finished.last_checkpoint / "config.json"
+    saved = json.loads(config.read_text())
+    for dtype in ("bfloat16", "float32"):
+        config.write_text(json.dumps({**saved, "dtype": dtype}))
+        finished.result_file.unlink()
+        run_cell(finished)
+        assert content(finished)["result"]["computed_in"] == dtype
+
+
 def test_a_killed_training_goes_on_as_if_it_had_not_been(finished):
     killed = replace(finished, name="killed")
     killed.folder.mkdir(parents=True)

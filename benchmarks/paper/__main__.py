@@ -53,7 +53,7 @@ def main() -> None:
     presets = options.presets or (list(PRESETS) if options.list else ["default"])
     chosen = presets, options.tasks, options.methods, options.seeds
     cells = packed_cells() if options.packed else make_cells(*chosen)
-    if not cells:
+    if not (cells or options.packed or options.report or options.unpack or options.join):
         parser.error("no preset that is chosen has such a task, or the method cannot do it")
     if options.list:
         for cell in cells:

@@ -137,9 +137,8 @@ def export(checkpoint: Path, target: Path, max_file_size: str = "5GB") -> None:
     if target.exists():
         raise FileExistsError(f"{target} exists already: delete it first")
     policy, *_ = load_policy(checkpoint)
-    if policy.ema is not None:
-        policy.planner.load_state_dict(policy.ema.module.state_dict())
-        policy.ema = None
+    policy.planner.load_state_dict(policy._planning_network.state_dict())
+    policy.ema = None
     policy.config.pretrained_path = None
     unfinished = target.with_name(f"{target.name}.new")
     shutil.rmtree(unfinished, ignore_errors=True)
