@@ -433,14 +433,13 @@ class HDPPolicy(PreTrainedPolicy):
 
     def _check_observations(self, batch: dict[str, Tensor]) -> None:
         for key in self.config.input_features:
-            if key not in batch:
-                raise ValueError(f"the planner was trained on {key}, which is not observed here")
-            if batch[key].device.type != self._device.type:
+            observed = _observed(batch, key)
+            if observed.device.type != self._device.type:
                 raise ValueError(
-                    f"{key} is on {batch[key].device}, the planner on {self._device}: make the preprocessor with "
+                    f"{key} is on {observed.device}, the planner on {self._device}: make the preprocessor with "
                     f'preprocessor_overrides={{"device_processor": {{"device": "{self._device}"}}}}'
                 )
-            if not torch.isfinite(batch[key]).all():
+            if not torch.isfinite(observed).all():
                 raise ValueError(f"{key} holds NaN or infinity: no plan can be made from it")
 
     def _encode_once(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -571,10 +570,7 @@ class HDPPolicy(PreTrainedPolicy):
         return [self._device] if self._device.type == "cuda" else []
 
     def _batch_size(self, batch: dict[str, Tensor]) -> int:
-        key = CONDITION if CONDITION in batch else next(iter(self.config.input_features))
-        if key not in batch:
-            raise ValueError(f"the planner was trained on {key}, which is not observed here")
-        return len(batch[key])
+        return len(_observed(batch, CONDITION if CONDITION in batch else next(iter(self.config.input_features))))
 
     def _motion_shape(self, batch: dict[str, Tensor]) -> tuple[int, int, int]:
         """(B, H_c, D)."""
@@ -663,6 +659,13 @@ def make_processes(config: HDPConfig) -> tuple[GaussianProcess, SymbolProcess | 
 def read_losses(**losses: Tensor) -> dict[str, float]:
     """Losses () as numbers, for logging. They are read at once: each reading makes the host wait for the device."""
     return dict(zip(losses, torch.stack(list(losses.values())).tolist(), strict=True))
+
+
+def _observed(batch: dict[str, Tensor], key: str) -> Tensor:
+    """An observation of a batch."""
+    if key not in batch:
+        raise ValueError(f"the planner was trained on {key}, which is not observed here")
+    return batch[key]
 
 
 def _one_text_each(prompt: str | Sequence[str], batch_size: int) -> list[str]:
