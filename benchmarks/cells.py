@@ -29,7 +29,7 @@ from lerobot_hdp.modeling_hdp import HDPPolicy
 from lerobot_hdp.scripts import hdp_train
 
 from .evaluation import evaluate, load_policy
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 
 WORK = Path("outputs/cells")
 DATASETS = Path("outputs/datasets")
@@ -229,7 +229,7 @@ class Progress:
         return cls(**json.loads(path.read_text())) if path.exists() else cls()
 
     def save(self, cell: Cell) -> None:
-        _write_json(cell.folder / "progress.json", asdict(self))
+        write_json(cell.folder / "progress.json", asdict(self))
 
 
 class Deadline:
@@ -317,7 +317,7 @@ def run_cell(cell: Cell, threads: int = 1, deadline: Deadline | None = None, tra
             return f"{cell.name}: {cell.state()}, out of time"
         *earlier, last = progress.runs
         result = result_of(cell, progress)
-        _write_json(cell.result_file, {"run": last, "earlier_runs": earlier, "result": result})
+        write_json(cell.result_file, {"run": last, "earlier_runs": earlier, "result": result})
     return f"{cell.name}: success {progress.curve[-1]['success_rate']:.0%} in the end, {result['train_s'] / 60:.1f} min"
 
 
@@ -351,9 +351,9 @@ def start_training(cell: Cell, threads: int, deadline: Deadline, train_flags: Se
     else:
         shutil.rmtree(cell.folder / "train", ignore_errors=True)
         (cell.folder / "progress.json").unlink(missing_ok=True)
-        _write_json(cell.settings_file, cell.settings)
+        write_json(cell.settings_file, cell.settings)
         config_file = cell.folder / "train_config.json"
-        _write_json(config_file, cell.train_config())
+        write_json(config_file, cell.train_config())
         arguments = [f"--config_path={config_file}"]
     arguments += train_flags
     if deadline.seconds_left < math.inf:
@@ -375,7 +375,7 @@ def _hdp_train(arguments: list[str], train_s: float) -> None:
 
     def save_checkpoint_and_time(checkpoint_dir: Path, *args: Any, **kwargs: Any) -> None:
         save_checkpoint(checkpoint_dir, *args, **kwargs)
-        _write_json(Path(checkpoint_dir) / TRAIN_S, train_s + time.monotonic() - start)
+        write_json(Path(checkpoint_dir) / TRAIN_S, train_s + time.monotonic() - start)
 
     lerobot_train.save_checkpoint = save_checkpoint_and_time
     sys.argv = ["hdp-train", *arguments]
@@ -420,7 +420,7 @@ def _evaluate(cell: Cell, checkpoint: Path, threads: int) -> dict[str, Any]:
 
 
 def _evaluate_into(path: Path, starts: int, first_seed: int, outcome: Path) -> None:
-    _write_json(outcome, evaluate(path, starts, first_seed, compile_model=False))  # it takes longer than the plans
+    write_json(outcome, evaluate(path, starts, first_seed, compile_model=False))  # it takes longer than the plans
 
 
 def result_of(cell: Cell, progress: Progress) -> dict[str, Any]:
@@ -471,11 +471,3 @@ def _run_with_log(log: Path, threads: int, function: Callable[..., None], *argum
     torch.set_num_threads(threads)
     when_parent_ends(lambda: os._exit(1))
     function(*arguments)
-
-
-def _write_json(path: Path, content: Any) -> None:
-    """Write a file, all of it or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".new")
-    unfinished.write_text(json.dumps(content, indent=2) + "\n")
-    unfinished.rename(path)

@@ -8,7 +8,7 @@ import json
 import time
 
 from .evaluation import evaluate
-from .machine import REPOSITORY, RESULTS, describe_run
+from .machine import REPOSITORY, RESULTS, describe_run, write_json
 
 FIRST_SEED = 3_000_000
 """Of the starts; no evaluation during training has these."""
@@ -31,8 +31,7 @@ def main() -> None:
             }
         )
         print(json.dumps(results[-1]))
-    content = {"run": describe_run(), "results": results}
-    (RESULTS / "checkpoints.json").write_text(json.dumps(content, indent=2) + "\n")
+    write_json(RESULTS / "checkpoints.json", {"run": describe_run(), "results": results})
 
 
 if __name__ == "__main__":

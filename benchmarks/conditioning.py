@@ -29,7 +29,7 @@ from gym_hdp_tasks.block_sorting_2d import SLOT_HALF_SIZE, block_name
 from lerobot_hdp.candidates import best_candidates
 
 from .evaluation import Subject, execute, load, make_plans, rate, wilson_interval
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 from .timing import timed
 
 CANDIDATES = (1, 2, 4, 8)
@@ -189,7 +189,7 @@ def main() -> None:
     results = COMMANDS[options.command](options.checkpoints, options.starts, options.num_inference_steps)
     task = results[0]["task"].removesuffix("-v0")
     path = options.results / f"{options.command}_{task}.json"
-    path.write_text(json.dumps({"run": run_facts, "results": results}, indent=2) + "\n")
+    write_json(path, {"run": run_facts, "results": results})
     print(f"written: {path}")
 
 

@@ -15,7 +15,7 @@ import gymnasium as gym
 from gym_hdp_tasks.env_config import HDPEnv
 
 from .cells import FIRST_EVALUATION_SEED
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 from .paper.presets import ENVS, observes_images
 
 FILE = RESULTS / "doing_nothing.json"
@@ -45,7 +45,7 @@ def main() -> None:
     for task in options.tasks:
         score = mean_score(HDPEnv(**ENVS[task]), options.starts)
         results[task] = {"run": run, "starts": options.starts, "mean_score": round(score, 4)}
-        FILE.write_text(json.dumps(results, indent=2) + "\n")
+        write_json(FILE, results)
         print(f"{task}: {score:.4f}", flush=True)
 
 

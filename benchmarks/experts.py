@@ -21,7 +21,7 @@ import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
 
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 
 XARM_TASKS = [gym_id for gym_id in EXPERTS if "XArm" in gym_id]
 
@@ -95,7 +95,7 @@ def main() -> None:
         run = describe_run()
         result = {"run": run, **measure(gym_id, options.num_episodes, options.robot)}
         print(json.dumps(result, indent=2), flush=True)
-        path.write_text(json.dumps(result, indent=2) + "\n")
+        write_json(path, result)
 
 
 if __name__ == "__main__":

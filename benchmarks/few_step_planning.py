@@ -16,7 +16,7 @@ from typing import Any
 from lerobot.configs.train import TrainPipelineConfig
 
 from .evaluation import evaluate
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 from .pages import DOCS, markdown_table
 
 FOLDER = RESULTS / "few_step_planning"
@@ -107,13 +107,12 @@ def main() -> None:
         "train_steps": train_config.steps,
         "curve": curve,
     }
-    FOLDER.mkdir(parents=True, exist_ok=True)
     file = FOLDER / f"{planner}_{task}.json"
     unfinished = file.with_suffix(".unfinished")
     for way, calls in product(options.ways, options.calls):
         curve.append(evaluate_way(options.checkpoint, way, calls, options.starts))
         print(curve[-1], flush=True)
-        unfinished.write_text(json.dumps({"run": run_facts, "result": result}, indent=2) + "\n")
+        write_json(unfinished, {"run": run_facts, "result": result})
     unfinished.rename(file)
     write_page()
 

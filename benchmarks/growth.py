@@ -26,7 +26,7 @@ from torch import Tensor
 from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.configuration_hdp import OBS_SYMBOLIC_PLAN
 
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 from .pages import DOCS, LABELS, markdown_table
 from .planner_latency import make_planner
 from .timing import compare
@@ -174,7 +174,7 @@ def main() -> None:
         measured = measure(env, env.planning_task.horizon, options.batch_size, options.rounds)
         result["over_blocks"].append({"n_blocks": n_blocks, **measured})
         print(json.dumps(result["over_blocks"][-1]), flush=True)
-    FILE.write_text(json.dumps({"run": run, "result": result}, indent=2) + "\n")
+    write_json(FILE, {"run": run, "result": result})
     write_page()
 
 

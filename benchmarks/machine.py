@@ -1,5 +1,6 @@
 """What a result has to say about where it comes from."""
 
+import json
 import os
 import platform
 import shlex
@@ -7,6 +8,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -27,6 +29,14 @@ def describe_run() -> dict[str, object]:
         "python": platform.python_version(),
         "packages": {name: import_module(name).__version__ for name in PACKAGES},
     }
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a file, all of it or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".new")
+    unfinished.write_text(json.dumps(content, indent=2) + "\n")
+    unfinished.rename(path)
 
 
 def git_commit() -> str:

@@ -23,7 +23,7 @@ from dataset_tools.experts import EXPERTS
 from gym_hdp_tasks import open_loop
 from gym_hdp_tasks.open_loop import execute_plans
 
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 
 FILE = RESULTS / "open_loop.json"
 SHAKE = 0.02
@@ -106,7 +106,7 @@ def main() -> None:
         run = describe_run()
         results[gym_id] = {"run": run, **measure(gym_id, options.num_plans, options.num_cores)}
         print(gym_id, json.dumps(results[gym_id], indent=2))
-    FILE.write_text(json.dumps(results, indent=2) + "\n")
+    write_json(FILE, results)
 
 
 if __name__ == "__main__":

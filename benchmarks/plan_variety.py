@@ -19,7 +19,7 @@ import numpy as np
 
 from .evaluation import load, make_plans
 from .few_step_planning import FIRST_SEED, WAYS
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 from .pages import DOCS, markdown_table
 
 FILE = RESULTS / "plan_variety.json"
@@ -91,7 +91,7 @@ def main() -> None:
                 result = measure(checkpoint, way, calls, options.starts)
                 results[f"{result['planner']}, {way}, {calls} calls"] = {"run": run, "result": result}
                 print(result, flush=True)
-                FILE.write_text(json.dumps(results, indent=2) + "\n")
+                write_json(FILE, results)
     write_page()
 
 

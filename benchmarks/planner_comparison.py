@@ -16,7 +16,7 @@ from lerobot_hdp.configuration_hdp import SAMPLERS
 
 from .cells import FIRST_EVALUATION_SEED, Cell, run_cells
 from .evaluation import evaluate
-from .machine import describe_run
+from .machine import describe_run, write_json
 from .paper.presets import METHODS, make_cells
 from .planner_report import PRESETS, SAMPLERS_FILE, SEEDS, TASKS, write_page
 
@@ -35,7 +35,7 @@ def compare_samplers(cells: list[Cell]) -> None:
             results.append(result | evaluate(checkpoint, cell.starts, first_seed, sampler=sampler))
             print(json.dumps(results[-1]), flush=True)
     facts = {"preset": cells[0].facts["preset"], "task": cells[0].facts["task_name"], "starts": cells[0].starts}
-    SAMPLERS_FILE.write_text(json.dumps({"run": run, **facts, "results": results}, indent=2) + "\n")
+    write_json(SAMPLERS_FILE, {"run": run, **facts, "results": results})
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp.modeling_hdp import HDPPolicy
 
 from .cells import num_parameters
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 from .pages import DOCS, markdown_table
 from .paper.presets import ENVS, METHODS, PRESETS, make_cell, observes_images
 from .timing import compare
@@ -129,9 +129,7 @@ def main() -> None:
         "parameter_ratio": {name: round(n / parameters[REFERENCE], 4) for name, n in parameters.items()},
         "batch_size": {size: measure(planners, size, options.rounds) for size in options.batch_sizes},
     }
-    FILES.mkdir(exist_ok=True)
-    content = json.dumps({"run": run, "result": result}, indent=2)
-    (FILES / f"{options.device}.json").write_text(content + "\n")
+    write_json(FILES / f"{options.device}.json", {"run": run, "result": result})
     write_page()
     print(PAGE.read_text())
 

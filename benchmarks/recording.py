@@ -31,7 +31,7 @@ from dataset_tools.record import (
 )
 from gym_hdp_tasks.env_config import HDPEnv
 
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 
 FILE = RESULTS / "recording.json"
 TASK = "XArmSorting-v0"
@@ -102,7 +102,7 @@ def main() -> None:
         shares = time_shares(obs_type, min(num_episodes, EPISODES_PER_SHARD))
         result[obs_type] = time_command(obs_type, num_episodes, options.num_workers) | shares
         print(json.dumps(result[obs_type], indent=2), flush=True)
-    FILE.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(FILE, result)
 
 
 if __name__ == "__main__":

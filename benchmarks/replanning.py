@@ -17,7 +17,7 @@ from pathlib import Path
 from lerobot.configs.train import TrainPipelineConfig
 
 from .evaluation import wilson_interval
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 
 FILE = RESULTS / "replanning.json"
 FIRST_SEED = 2_000_000
@@ -63,7 +63,7 @@ def main() -> None:
     training = {"steps": config.steps, "batch_size": config.batch_size, "policy": config.policy.type}
     training |= {name: getattr(config.policy, name) for name in ("plan_from", "horizon", "num_layers", "width")}
     result = {"env": task, "training": training, "starts": options.starts, "curve": curve}
-    FILE.write_text(json.dumps({"run": run, "result": result}, indent=2) + "\n")
+    write_json(FILE, {"run": run, "result": result})
     print(json.dumps(curve, indent=2))
 
 

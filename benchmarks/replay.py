@@ -21,7 +21,7 @@ from dataset_tools.record import RecordConfig, RecordDatasetConfig, record
 from dataset_tools.replay import load_recording, replay
 from gym_hdp_tasks.env_config import TASKS, HDPEnv
 
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 
 FILE = RESULTS / "replay.json"
 DATASETS = Path("outputs/benchmarks/replay")
@@ -61,7 +61,7 @@ def main() -> None:
             continue
         run = describe_run()
         results[task] = {"run": run, **measure(task, options.num_episodes, options.num_workers)}
-        FILE.write_text(json.dumps(results, indent=2) + "\n")
+        write_json(FILE, results)
         print(task, json.dumps(results[task], indent=2))
 
 

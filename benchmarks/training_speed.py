@@ -26,7 +26,7 @@ from lerobot.datasets import LeRobotDataset
 import lerobot_policy_hdp  # noqa: F401 (registers the planners)
 from lerobot_hdp.in_memory_dataset import InMemoryDataset
 
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 from .pages import DOCS
 from .timing import quartiles, quartiles_of_ratio, take_turns
 from .training_step import describe_steps, endless, open_for_training, training_steps
@@ -149,7 +149,7 @@ def main() -> None:
     result["data_path"] = data_path(dataset, options.batch_size, options.horizon, options.rounds)
     result["step"] = step_overhead(dataset, config, options.batch_size, options.rounds)
     result["end_to_end"] = end_to_end(flags, options.steps, options.command_rounds)
-    FILE.write_text(json.dumps({"run": run, "result": result}, indent=2) + "\n")
+    write_json(FILE, {"run": run, "result": result})
     write_page()
     print(PAGE.read_text())
 

@@ -28,7 +28,7 @@ from torch.utils.data import DataLoader
 import lerobot_policy_hdp  # noqa: F401 (registers the planners)
 from lerobot_hdp.in_memory_dataset import InMemoryDataset
 
-from .machine import RESULTS, describe_run
+from .machine import RESULTS, describe_run, write_json
 from .pages import markdown_table
 from .timing import quartiles, take_turns, timed
 
@@ -171,7 +171,7 @@ def main() -> None:
         rounds = len(next(iter(times.values())))
         milliseconds = {name: quartiles([1000 * s / options.steps for s in found]) for name, found in times.items()}
         result = {**facts, "rounds": rounds, "first_step_s": first_call_s, "ms": milliseconds}
-        FILE.write_text(json.dumps({"run": describe_run(), "result": result}, indent=2) + "\n")
+        write_json(FILE, {"run": describe_run(), "result": result})
         print(f"{rounds} of {options.rounds} rounds: " + ", ".join(f"{n} {ms[1]} ms" for n, ms in milliseconds.items()))
 
     take_turns(functions, options.rounds, after_round=save)

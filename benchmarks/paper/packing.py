@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 
 from ..cells import DATASETS, WORK, Cell, complete_checkpoints, record_dataset
 from ..evaluation import load_policy
-from ..machine import REPOSITORY, RESULTS, git_commit
+from ..machine import REPOSITORY, RESULTS, git_commit, write_json
 
 CODE = ("benchmarks/*.py", "benchmarks/paper", "dataset_tools", "gym_hdp_tasks", "lerobot_hdp", "lerobot_policy_hdp.py")
 METADATA = ("METADATA", "entry_points.txt")
@@ -49,7 +49,7 @@ def pack(cells: Sequence[Cell], folder: Path) -> None:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(REPOSITORY / file, folder / file)
     (folder / "COMMIT").write_text(git_commit() + "\n")
-    (folder / CELLS).write_text(json.dumps([asdict(cell) for cell in cells], indent=2) + "\n")
+    write_json(folder / CELLS, [asdict(cell) for cell in cells])
     _pack_metadata(folder)
     for cell in {cell.dataset_root: cell for cell in cells}.values():
         record_dataset(cell, num_workers=2)
