@@ -52,10 +52,11 @@ class DecoderLayer(nn.TransformerDecoderLayer):
         if positions is not None:
             half = self.self_attn.head_dim // 2
             angles = positions[:, None] * 10_000 ** (-torch.arange(half) / half)
+            cosines, sines = angles.cos(), angles.sin()
             self.cosines: Tensor
             self.sines: Tensor
-            self.register_buffer("cosines", angles.cos(), persistent=False)
-            self.register_buffer("sines", angles.sin(), persistent=False)
+            self.register_buffer("cosines", torch.cat([cosines, cosines], dim=-1), persistent=False)
+            self.register_buffer("sines", torch.cat([-sines, sines], dim=-1), persistent=False)
 
     def _sa_block(
         self, x: Tensor, attn_mask: Tensor | None, key_padding_mask: Tensor | None, is_causal: bool = False
@@ -63,9 +64,9 @@ class DecoderLayer(nn.TransformerDecoderLayer):
         assert attn_mask is None
         assert key_padding_mask is None
         attention = self.self_attn
-        query, key, value = _heads(x, attention.in_proj_weight, attention.in_proj_bias, attention.head_dim)
-        if self.rotary:
-            query, key = self._rotate(query), self._rotate(key)
+        heads = _heads(x, attention.in_proj_weight, attention.in_proj_bias, attention.head_dim)
+        compared, [value] = heads.split([2, 1])
+        query, key = self._rotate(compared) if self.rotary else compared
         return self.dropout1(_attend(attention, query, key, value))
 
     def _mha_block(
@@ -87,10 +88,9 @@ class DecoderLayer(nn.TransformerDecoderLayer):
         return self.dropout2(_attend(attention, query, key, value))
 
     def _rotate(self, vectors: Tensor) -> Tensor:
-        """Rotate each pair of components (i, i + half) by its token's angle: (B, heads, L, head_dim)."""
-        first, second = vectors.chunk(2, dim=-1)
+        """Rotate each pair of components (i, i + half) by its token's angle: (..., L, head_dim)."""
         cosines, sines = self.cosines.to(vectors.dtype), self.sines.to(vectors.dtype)
-        return torch.cat([first * cosines - second * sines, first * sines + second * cosines], dim=-1)
+        return vectors * cosines + vectors.roll(vectors.shape[-1] // 2, dims=-1) * sines
 
 
 def _heads(x: Tensor, weight: Tensor, bias: Tensor, head_dim: int) -> Tensor:
