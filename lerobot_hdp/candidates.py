@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Generator, Tensor
 
+from .denoiser import Denoise
 from .processes import Corrupted, GaussianProcess, MaskedProcess
-from .sampling import Denoise
 
 MOTION_LEVELS = (0.25, 0.5, 0.75)
 """Levels at which the motion is denoised again to score it."""

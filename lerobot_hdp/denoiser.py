@@ -1,6 +1,7 @@
 """D_theta: one transformer that denoises the motion and the symbols together (paper, Fig. "Architecture")."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -19,6 +20,10 @@ class Prediction(NamedTuple):
 
     motion: Tensor
     symbols: Tensor | None
+
+
+Denoise = Callable[[Tensor, Tensor | None, Tensor, Tensor], Prediction]
+"""(motion (B, H_c, D), symbols (B, H_d, ...), k_c (B,), k_d (B,)) -> Prediction, for a fixed observation."""
 
 
 class SinusoidalEmbedding(nn.Module):

@@ -10,11 +10,9 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
 import torch
 from huggingface_hub import ModelCard
 from huggingface_hub.constants import CONFIG_NAME
-from lerobot.configs import NormalizationMode
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
@@ -24,7 +22,8 @@ from torch import Generator, Tensor, nn
 
 from .candidates import PARTIAL_MOTION_CANDIDATES, best_candidates, score_plans
 from .configuration_hdp import OBS_SYMBOLIC_PLAN, HDPConfig
-from .denoiser import Denoiser, Prediction
+from .dataset_checks import check_episodes_fit, check_statistics, check_token_ids
+from .denoiser import Denoise, Denoiser, Prediction
 from .encoders import ImageEncoder, StateEncoder
 from .lerobot_workarounds import keep_data_order_on_resume
 from .model_card import describe_planner
@@ -32,15 +31,12 @@ from .moving_average import MovingAverage
 from .optimizer import parameter_groups
 from .plan import Plan, PlanCheck, PlanPrompt
 from .processes import GaussianProcess, GaussianSymbolProcess, MaskedProcess, SymbolProcess
-from .processes.base import expand_to
 from .processor_hdp import widen_narrow_ranges
 from .prompt import place_prompts
-from .sampling import Denoise, DenoisingState, sample_plan
-from .training_noise import TrainingNoise, mix_seeds
+from .sampling import DenoisingState, sample_plan
+from .training import TrainingNoise, add_pose_noise, mix_seeds, pose_noise_std, read_losses, training_loss
 from .vocabulary import FREE, PAD_ID, Vocabulary
 
-POSE_NOISE_POWER = 3
-"""Of the share of noise in the motion's variance: how fast `observation_noise` falls as the motion becomes clear."""
 MEANING_OF_WEIGHTS = ("prediction_type", "rotary", "num_heads", "num_train_timesteps")
 """Settings that weights of the same shapes are nothing without: with another, they make plans that look like plans."""
 CONDITION = "condition_tokens"
@@ -160,8 +156,8 @@ class HDPPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         if dataset_stats is not None:
-            _check_statistics(config, dataset_stats)
-            _check_token_ids(config, dataset_stats)
+            check_statistics(config, dataset_stats)
+            check_token_ids(config, dataset_stats)
             if config.pretrained_path is not None:
                 widen_narrow_ranges(config, dataset_stats)
         if config.num_candidates > 1:
@@ -169,7 +165,7 @@ class HDPPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             keep_data_order_on_resume()
             if config.plans_whole_episodes:
-                _check_episodes_fit(config, dataset_meta.episodes["length"])
+                check_episodes_fit(config, dataset_meta.episodes["length"])
             if dataset_meta.total_tasks > 1:
                 logging.warning(
                     "The dataset has %d tasks, and the planner does not read which is asked for: tell them apart by "
@@ -193,7 +189,7 @@ class HDPPolicy(PreTrainedPolicy):
         self.register_buffer("forward_calls", torch.tensor(0))
         self._seed_and_calls: tuple[int, int] | None = None
         self.pose_noise: Tensor | None
-        noise = _pose_noise(config, dataset_stats) if config.observation_noise and dataset_stats else None
+        noise = pose_noise_std(config, dataset_stats) if config.observation_noise and dataset_stats else None
         self.register_buffer("pose_noise", noise, persistent=False)
         self.register_load_state_dict_pre_hook(self._start_or_end_average)
         self.reset()
@@ -277,39 +273,35 @@ class HDPPolicy(PreTrainedPolicy):
     def _loss(
         self, batch: dict[str, Tensor], network: Planner, noise: TrainingNoise
     ) -> tuple[Tensor, dict[str, float]]:
-        motion = self._motion(batch)
-        k_c = noise.level(self.motion_process, len(motion))
-        if self.config.lead_share > 0:  # pure noise, as in planning while the symbols lead
-            k_c = k_c.masked_fill(noise.choose(self.config.lead_share, len(motion)), 1.0)
-        noisy_motion = noise.corrupt(self.motion_process, motion, k_c)
-        observation = network.encode(self._with_pose_noise(batch, k_c, noise))
-        if self.symbol_process is None:
-            prediction = network.denoiser(noisy_motion.value, None, observation, k_c, torch.zeros_like(k_c))
-            loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
-            return loss, read_losses(motion_loss=loss)
+        def denoise(motion: Tensor, symbols: Tensor | None, k_c: Tensor, k_d: Tensor) -> Prediction:
+            observation = network.encode(self._with_pose_noise(batch, k_c, noise))
+            return network.denoiser(motion, symbols, observation, k_c, k_d)
 
-        k_d = k_c if self.config.shared_level else noise.level(self.symbol_process, len(motion))
-        corrupted_symbols = noise.corrupt(self.symbol_process, batch[OBS_SYMBOLIC_PLAN], k_d)
-        prediction = network.denoiser(noisy_motion.value, corrupted_symbols.value, observation, k_c, k_d)
-        motion_loss = self.motion_process.loss(prediction.motion, noisy_motion).mean()
-        symbol_loss = self.symbol_process.loss(prediction.symbols, corrupted_symbols).mean()
-        loss = motion_loss + self.config.symbol_loss_weight * symbol_loss
-        return loss, read_losses(motion_loss=motion_loss, symbol_loss=symbol_loss)
+        loss, parts = training_loss(
+            denoise,
+            self.motion_process,
+            self.symbol_process,
+            self._motion(batch),
+            batch[OBS_SYMBOLIC_PLAN] if self.symbol_process else None,
+            noise,
+            symbol_loss_weight=self.config.symbol_loss_weight,
+            shared_level=self.config.shared_level,
+            lead_share=self.config.lead_share,
+        )
+        return loss, read_losses(parts)
 
     def _motion(self, batch: dict[str, Tensor]) -> Tensor:
         """The actions, (B, H, D); LeRobot's are (B, H) where D is 1."""
         return batch[ACTION].reshape(len(batch[ACTION]), -1, *self.config.action_feature.shape)
 
     def _with_pose_noise(self, batch: dict[str, Tensor], k_c: Tensor, noise: TrainingNoise) -> dict[str, Tensor]:
-        """A batch whose poses are, in training, the less known the noisier the motion is; see `observation_noise`."""
+        """A batch for training, with `observation_noise` on its poses."""
         if not (self.training and self.config.observation_noise):
             return batch
         if self.pose_noise is None:
             raise ValueError("observation_noise has the units of the poses: make the policy with dataset_stats")
-        poses = batch[OBS_ENV_STATE]
-        strength = (1 - self.motion_process.alpha_bar(k_c)) ** POSE_NOISE_POWER
-        blurred = poses + expand_to(strength, poses) * self.pose_noise * noise.normal(poses)
-        return {**batch, OBS_ENV_STATE: blurred}
+        poses = add_pose_noise(batch[OBS_ENV_STATE], self.pose_noise, self.motion_process, k_c, noise)
+        return {**batch, OBS_ENV_STATE: poses}
 
     @torch.no_grad()
     @_without_dropout
@@ -655,12 +647,6 @@ def make_processes(config: HDPConfig) -> tuple[GaussianProcess, SymbolProcess | 
             return motion, None
 
 
-@torch.no_grad()
-def read_losses(**losses: Tensor) -> dict[str, float]:
-    """Losses () as numbers, for logging. They are read at once: each reading makes the host wait for the device."""
-    return dict(zip(losses, torch.stack(list(losses.values())).tolist(), strict=True))
-
-
 def _observed(batch: dict[str, Tensor], key: str) -> Tensor:
     """An observation of a batch."""
     if key not in batch:
@@ -681,64 +667,3 @@ def _one_text_each(prompt: str | Sequence[str], batch_size: int) -> list[str]:
 def _without_recorded_plans(token_ids: Tensor) -> Tensor:
     """Prompts (B, H_d), of which those that leave nothing open, as what a dataset has recorded, give nothing."""
     return token_ids.masked_fill((token_ids >= PAD_ID).all(dim=1, keepdim=True), FREE)
-
-
-def _pose_noise(config: HDPConfig, stats: dict[str, Any]) -> Tensor:
-    """`observation_noise` of each component of the poses, normalised as these are: (n,)."""
-    ranges = {OBS_ENV_STATE: dict(stats[OBS_ENV_STATE])}
-    widen_narrow_ranges(config, ranges)
-    low, high = (torch.as_tensor(ranges[OBS_ENV_STATE][bound]) for bound in ("min", "max"))
-    return (config.observation_noise * 2 / (high - low)).float()
-
-
-def _check_statistics(config: HDPConfig, stats: dict[str, Any]) -> None:
-    """Whether all that is normalised can be: LeRobot would leave the rest as it is, without a word."""
-    for key, feature in {**config.input_features, **config.output_features}.items():
-        if config.normalization_mapping.get(feature.type.value) in (None, NormalizationMode.IDENTITY):
-            continue
-        if key not in stats:
-            raise ValueError(
-                f"there are no statistics of {key}, to normalise it by. Where --rename_map renames it, train with "
-                "hdp-train; where it was added to the dataset, first run lerobot-edit-dataset "
-                "--operation.type=recompute_stats"
-            )
-        for name in ("min", "max", "mean", "std"):
-            unknown = np.flatnonzero(~np.isfinite(np.asarray(stats[key].get(name, 0.0))))
-            if len(unknown):
-                raise ValueError(
-                    f"the {name} of {key} in the dataset is NaN or infinite, in components {unknown.tolist()}: mend "
-                    "its frames, then run lerobot-edit-dataset --operation.type=recompute_stats"
-                )
-
-
-def _check_token_ids(config: HDPConfig, stats: dict[str, Any]) -> None:
-    """Whether the dataset's plans hold symbols alone, as far as its statistics say."""
-    if config.symbol_process is None or OBS_SYMBOLIC_PLAN not in stats:
-        return
-    plans, last = stats[OBS_SYMBOLIC_PLAN], len(config.vocabulary) - 1
-    low, high = int(np.min(plans["min"])), int(np.max(plans["max"]))
-    if low < PAD_ID or high > last:
-        raise ValueError(
-            f"{OBS_SYMBOLIC_PLAN} holds token ids from {low} to {high}, but the symbols are 0 to {last}: what follows "
-            f"a plan is {PAD_ID}"
-        )
-
-
-def _check_episodes_fit(config: HDPConfig, lengths: Sequence[int]) -> None:
-    """A plan holds a whole episode: the longest has the horizon's length, or less in fine-tuning.
-
-    LeRobot gives a policy the metadata of all episodes, and does not say which of them it trains on.
-    """
-    longest, fine_tunes = max(lengths), config.pretrained_path is not None
-    if longest > config.horizon or (longest < config.horizon and not fine_tunes):
-        remedy = "the checkpoint's plans cannot hold them" if fine_tunes else f"set --policy.horizon={longest}"
-        raise ValueError(
-            f"the dataset's episodes have up to {longest} frames, the planner's horizon is {config.horizon}: {remedy}. "
-            "Episodes that --dataset.episodes leaves out count, too; lerobot-edit-dataset can delete them."
-        )
-    if shorter := sum(length < config.horizon for length in lengths):
-        logging.warning(
-            "%d of %d episodes are shorter than the planner's horizon of %d: with hdp-train they hold their last "
-            "action; lerobot-train leaves them out.",
-            shorter, len(lengths), config.horizon,
-        )  # fmt: skip

@@ -2,19 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Generator, Tensor
 
-from .denoiser import Prediction
+from .denoiser import Denoise
 from .plan import PlanPrompt
 from .processes import GaussianProcess, MaskedProcess, Process, SymbolProcess
 from .processes.base import expand_to
 from .vocabulary import PAD_ID
-
-Denoise = Callable[[Tensor, Tensor | None, Tensor, Tensor], Prediction]
-"""(motion (B, H_c, D), symbols (B, H_d, ...), k_c (B,), k_d (B,)) -> Prediction, for a fixed observation."""
 
 
 class DenoisingState(NamedTuple):
@@ -59,6 +56,25 @@ class Stream:
         else:
             self.all_given = self.given.flatten(1).all(dim=1)
 
+    @classmethod
+    def start(
+        cls,
+        process: Process,
+        shape: tuple[int, ...],
+        num_steps: int,
+        clean: Tensor | None = None,
+        given: Tensor | None = None,
+        *,
+        device: torch.device,
+        shared_level: bool,
+        generator: Generator | None,
+    ) -> Self:
+        """A process where its way back begins: fully corrupted, but for what is given."""
+        levels = process.levels(num_steps).to(device)
+        stream = cls(process, process.prior(shape, device, generator), levels, clean, given, shared_level)
+        stream.set_given(0, generator)
+        return stream
+
     def level(self, step: int) -> Tensor:
         """The level before a step, as the denoiser is told of it: (B,)."""
         return self.process.told_level(self.value, self.levels[step]).masked_fill(self.all_given, 0.0)
@@ -74,6 +90,39 @@ class Stream:
         levels = self.levels[step], self.levels[step + 1]
         self.value = self.process.reverse_step(self.value, prediction, *levels, generator)
         self.set_given(step + 1, generator)
+
+
+@dataclass
+class SymbolStream(Stream):
+    """The symbols' process on its way back.
+
+    Attributes:
+        token_probabilities: see `DenoisingState`.
+        not_pad: (B, H_d) bool, where the masked process draws no PAD; None: it may be anywhere.
+    """
+
+    process: SymbolProcess
+    not_pad: Tensor | None = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.draws_tokens = isinstance(self.process, MaskedProcess)
+        nothing = self.value.new_zeros(self.value.shape if self.draws_tokens else (len(self.value), 0))
+        self.token_probabilities = (self.given if self.given is not None and self.draws_tokens else nothing).float()
+
+    @property
+    def tokens(self) -> Tensor:
+        """What the value stands for, masks included: (B, H_d)."""
+        return self.process.tokens(self.value)
+
+    def advance(self, step: int, prediction: Tensor, generator: Generator | None) -> None:
+        if self.draws_tokens and self.not_pad is not None:
+            prediction[..., PAD_ID] = prediction[..., PAD_ID].masked_fill(self.not_pad, -torch.inf)
+        before = self.value
+        super().advance(step, prediction, generator)
+        if self.draws_tokens:
+            drawn = _token_probabilities(prediction, self.value)
+            self.token_probabilities = torch.where(self.value == before, self.token_probabilities, drawn)
 
 
 @torch.no_grad()
@@ -113,55 +162,39 @@ def sample_plan(
         on_step: called after each step with its number and the state, and before the first with 0.
     """
     prompt = prompt or PlanPrompt()
-
     can_lead = symbol_process is not None and not shared_level
     lead = _steps_ahead(prompt, symbol_lead, num_steps) if can_lead else 0
 
-    def start(
-        process: Process, shape: tuple[int, ...], steps: int, clean: Tensor | None, given: Tensor | None
-    ) -> Stream:
-        prior = process.prior(shape, device, generator)
-        stream = Stream(process, prior, process.levels(steps).to(device), clean, given, shared_level)
-        stream.set_given(0, generator)
-        return stream
-
-    batch_size = motion_shape[0]
-    motion = start(motion_process, motion_shape, num_steps - lead, prompt.actions, prompt.actions_mask)
-    symbols: Stream | None = None
-    tokens: Tensor | None = None
-    probabilities = torch.zeros(batch_size, 0, device=device)
-    k_d = torch.zeros(batch_size, device=device)
-    not_pad = prompt.not_pad if isinstance(symbol_process, MaskedProcess) else None
+    how: dict[str, Any] = {"device": device, "shared_level": shared_level, "generator": generator}
+    given = prompt.actions, prompt.actions_mask
+    motion = Stream.start(motion_process, motion_shape, num_steps - lead, *given, **how)
+    symbols = None
     if symbol_process is not None:
-        shape = batch_size, symbolic_horizon
-        symbols = start(symbol_process, shape, num_steps, prompt.token_ids, prompt.tokens_mask)
-        tokens = symbol_process.tokens(symbols.value)
-        if isinstance(symbol_process, MaskedProcess):
-            probabilities = (tokens != symbol_process.mask_id).float()
+        shape, given = (motion_shape[0], symbolic_horizon), (prompt.token_ids, prompt.tokens_mask)
+        symbols = SymbolStream.start(symbol_process, shape, num_steps, *given, **how)
+        symbols.not_pad = prompt.not_pad
+    nothing = torch.zeros(motion_shape[0], 0, device=device)
+    clean = torch.zeros(motion_shape[0], device=device)
+
+    def state() -> DenoisingState:
+        if symbols is None:
+            return DenoisingState(motion.value, None, nothing)
+        return DenoisingState(motion.value, symbols.tokens, symbols.token_probabilities)
 
     if on_step is not None:
-        on_step(0, DenoisingState(motion.value, tokens, probabilities))
+        on_step(0, state())
     for i in range(num_steps):
-        if symbols is not None:
-            k_d = symbols.level(i)
-        motion_step = max(i - lead, 0)
-        prediction = denoise(motion.value, symbols.value if symbols else None, motion.level(motion_step), k_d)
+        j = max(i - lead, 0)  # the motion's step
+        k_c, k_d = motion.level(j), clean if symbols is None else symbols.level(i)
+        prediction = denoise(motion.value, None if symbols is None else symbols.value, k_c, k_d)
         if i >= lead:
-            motion.advance(motion_step, prediction.motion, generator)
+            motion.advance(j, prediction.motion, generator)
         if symbols is not None:
-            assert symbol_process is not None
             assert prediction.symbols is not None
-            before, scores = symbols.value, prediction.symbols
-            if not_pad is not None:
-                scores[..., PAD_ID] = scores[..., PAD_ID].masked_fill(not_pad, -torch.inf)
-            symbols.advance(i, scores, generator)
-            tokens = symbol_process.tokens(symbols.value)
-            if isinstance(symbol_process, MaskedProcess):
-                drawn = _token_probabilities(scores, tokens)
-                probabilities = torch.where(tokens == before, probabilities, drawn)
+            symbols.advance(i, prediction.symbols, generator)
         if on_step is not None:
-            on_step(i + 1, DenoisingState(motion.value, tokens, probabilities))
-    return DenoisingState(motion.value, tokens, probabilities)
+            on_step(i + 1, state())
+    return state()
 
 
 def _steps_ahead(prompt: PlanPrompt, symbol_lead: float, num_steps: int) -> int:

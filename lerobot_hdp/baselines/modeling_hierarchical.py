@@ -6,6 +6,7 @@ vector.
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -13,10 +14,10 @@ from torch import Generator, Tensor, nn
 
 from ..denoiser import Denoiser, Prediction
 from ..encoders import StateEncoder
-from ..modeling_hdp import HDPPolicy, read_losses
+from ..modeling_hdp import HDPPolicy
 from ..plan import Plan, PlanPrompt
 from ..sampling import DenoisingState, Stream, sample_plan
-from ..training_noise import TrainingNoise
+from ..training import TrainingNoise, read_losses
 from .configuration_hierarchical import CoupledHierarchicalDiffuserConfig, HierarchicalDiffuserConfig
 
 
@@ -143,7 +144,7 @@ class HierarchicalDiffuserPolicy(HDPPolicy):
         noisy_segments = noise.corrupt(process, segments, noise.level(process, len(segments)))
         prediction = network.denoise_segments(noisy_segments.value, state, subgoals, noisy_segments.level)
         motion_loss = process.loss(prediction, noisy_segments).mean()
-        return subgoal_loss + motion_loss, read_losses(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
+        return subgoal_loss + motion_loss, read_losses({"subgoal_loss": subgoal_loss, "motion_loss": motion_loss})
 
     def _sample(
         self,
@@ -212,7 +213,7 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
         high, low = self._denoise_both(network, noisy_subgoals.value, noisy_segments.value, state, level)
         subgoal_loss = process.loss(high, noisy_subgoals).mean()
         motion_loss = process.loss(low, noisy_segments).mean()
-        return subgoal_loss + motion_loss, read_losses(subgoal_loss=subgoal_loss, motion_loss=motion_loss)
+        return subgoal_loss + motion_loss, read_losses({"subgoal_loss": subgoal_loss, "motion_loss": motion_loss})
 
     def _denoise_both(
         self, network: HierarchicalPlanner, subgoals: Tensor, segments: Tensor, state: Tensor, level: Tensor
@@ -245,21 +246,14 @@ class CoupledHierarchicalDiffuserPolicy(HierarchicalDiffuserPolicy):
         network, state = self._planning_network, self._states(batch)[:, 0]
         batch_size, _, action_dim = self._motion_shape(batch)
         config, process, device = self.config, self.motion_process, state.device
-        levels = process.levels(self.config.num_inference_steps).to(device)
-
-        def start(shape: tuple[int, int, int], clean: Tensor | None = None, given: Tensor | None = None) -> Stream:
-            stream = Stream(process, process.prior(shape, device, generator), levels, clean, given, shared_level=True)
-            stream.set_given(0, generator)
-            return stream
-
-        given = self._segments_prompt(prompt)
-        subgoals = start((batch_size, config.num_segments, state.shape[1]))
-        segments = start(
-            (batch_size * config.num_segments, config.subgoal_interval, action_dim), given.actions, given.actions_mask
-        )
+        how: dict[str, Any] = {"device": device, "shared_level": True, "generator": generator}
+        steps, given = config.num_inference_steps, self._segments_prompt(prompt)
+        subgoals = Stream.start(process, (batch_size, config.num_segments, state.shape[1]), steps, **how)
+        shape = batch_size * config.num_segments, config.subgoal_interval, action_dim
+        segments = Stream.start(process, shape, steps, given.actions, given.actions_mask, **how)
         if on_step is not None:
             on_step(0, self._show(segments.value))
-        for i in range(self.config.num_inference_steps):
+        for i in range(steps):
             with self._autocast():
                 high, low = self._denoise_both(network, subgoals.value, segments.value, state, subgoals.level(i))
             subgoals.advance(i, high.float(), generator)

@@ -113,5 +113,9 @@ class MaskedProcess:
 
 
 def _draw(probabilities: Tensor, generator: Generator | None) -> Tensor:
-    """A token from each categorical distribution: (B, H, m) -> (B, H)."""
-    return torch.multinomial(probabilities.flatten(0, -2), 1, generator=generator).reshape(probabilities.shape[:-1])
+    """A token from each categorical distribution: (B, H, m) -> (B, H).
+
+    The symbol whose exponential clock, of rate p, rings first; `torch.multinomial` draws so too, but first makes the
+    host wait for the device, to check the probabilities.
+    """
+    return (probabilities / torch.empty_like(probabilities).exponential_(generator=generator)).argmax(dim=-1)
