@@ -244,45 +244,57 @@ class HDPConfig(PreTrainedConfig):
                 setattr(self, name, value)
         if self.num_inference_steps is None:
             self.num_inference_steps = self.num_train_timesteps
+        self._check_values()
+        self._check_combinations()
+        if self.dtype == "bfloat16" and not bfloat16_is_fast(self.device):
+            message = f"{self.device} has no bfloat16 instructions here: computing in float32, which is faster"
+            warnings.warn(message, stacklevel=3)  # of whoever made the configuration, above the dataclass's own code
+            self.dtype = "float32"
+
+    def _check_values(self) -> None:
+        """Whether each value can be, by itself."""
         _check_choice("plan_from", self.plan_from, ["episode_start", "any_frame"])
         _check_choice("prediction_type", self.prediction_type, PREDICTION_TYPES)
         _check_choice("sampler", self.sampler, SAMPLERS)
         _check_choice("optimizer_type", self.optimizer_type, OPTIMIZERS)
         _check_choice("mask_schedule", self.mask_schedule, MASK_SCHEDULES)
         _check_choice("vision_backbone", self.vision_backbone, VISION_BACKBONES)
-        if self.pretrained_backbone_weights is not None:
-            choices = [str(weights) for weights in get_model_weights(self.vision_backbone)]
-            _check_choice("pretrained_backbone_weights", self.pretrained_backbone_weights, choices)
         _check_choice("dtype", self.dtype, ["float32", "bfloat16"])
-        if self.dtype == "bfloat16" and not bfloat16_is_fast(self.device):
-            message = "this CPU has no bfloat16 instructions: computing in float32, which is faster"
-            warnings.warn(message, stacklevel=3)  # of whoever made the configuration, above the dataclass's own code
-            self.dtype = "float32"
+        for name in AT_LEAST_1:
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ParsingError(f"{name} must be at least 1, got {value}")
+        for name in ("observation_noise", "state_encoder_hidden_dim"):
+            if getattr(self, name) < 0:
+                raise ParsingError(f"{name} must be at least 0, got {getattr(self, name)}")
+        for name in ("dropout", "confidence_threshold", "lead_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ParsingError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+        if not 0 <= self.symbol_lead < 1:
+            raise ParsingError(f"symbol_lead must be at least 0 and less than 1, got {self.symbol_lead}")
+        if self.resize_shape is not None and min(self.resize_shape) < 1:
+            raise ParsingError(f"resize_shape is a height and a width of at least 1, got {self.resize_shape}")
         if self.use_amp:
             raise ParsingError(
                 "use_amp is for policies without a dtype: set use_amp=false, and dtype=bfloat16 for speed"
             )
         if self.n_obs_steps != 1:
             raise ParsingError(f"the planner sees one observation: n_obs_steps must be 1, got {self.n_obs_steps}")
-        for name in AT_LEAST_1:
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ParsingError(f"{name} must be at least 1, got {value}")
-        for name in ("dropout", "confidence_threshold", "lead_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ParsingError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
-        if not 0 <= self.symbol_lead < 1:
-            raise ParsingError(f"symbol_lead must be at least 0 and less than 1, got {self.symbol_lead}")
+        for modality in self.planned_modalities:
+            if self.normalization_mapping.get(modality) is not NormalizationMode.MIN_MAX:
+                raise ParsingError(f"what is planned lies in [-1, 1]: normalization_mapping needs {modality}: MIN_MAX")
+
+    def _check_combinations(self) -> None:
+        """Whether the values go with each other."""
+        if self.pretrained_backbone_weights is not None:
+            choices = [str(weights) for weights in get_model_weights(self.vision_backbone)]
+            _check_choice("pretrained_backbone_weights", self.pretrained_backbone_weights, choices)
         if self.lead_share and (self.symbol_process is None or self.shared_level):
             raise ParsingError("lead_share is about symbols with a level of their own, which this planner has not")
-        if self.observation_noise < 0:
-            raise ParsingError(f"observation_noise must be at least 0, got {self.observation_noise}")
         if self.observation_noise and "ENV" in self.planned_modalities:
             raise ParsingError(f"observation_noise is not for planners of type {self.type}, whose plans are poses")
         if self.observation_noise and self.normalization_mapping.get("ENV") is not NormalizationMode.MIN_MAX:
             raise ParsingError("observation_noise knows the units of poses with normalization_mapping ENV: MIN_MAX")
-        if self.resize_shape is not None and min(self.resize_shape) < 1:
-            raise ParsingError(f"resize_shape is a height and a width of at least 1, got {self.resize_shape}")
         if self.width % self.num_heads or self.width % 2 or self.width < NARROWEST_WIDTH:
             raise ParsingError(
                 f"width must be even, divisible by {self.num_heads=} and at least {NARROWEST_WIDTH}, got {self.width}"
@@ -292,8 +304,6 @@ class HDPConfig(PreTrainedConfig):
                 f"rotary embedding needs an even width / num_heads, got {self.width} / {self.num_heads}: "
                 "choose another width, or rotary=false"
             )
-        if self.state_encoder_hidden_dim < 0:
-            raise ParsingError(f"state_encoder_hidden_dim must be at least 0, got {self.state_encoder_hidden_dim}")
         if self.horizon and self.n_action_steps and self.n_action_steps != self.horizon:
             if self.n_action_steps > self.horizon:
                 raise ParsingError(f"n_action_steps={self.n_action_steps} is more than the plan has ({self.horizon=})")
@@ -302,9 +312,6 @@ class HDPConfig(PreTrainedConfig):
                     f"n_action_steps={self.n_action_steps} of {self.horizon} plans again in the middle of an episode, "
                     "which a planner of whole episodes has not seen: train with plan_from=any_frame, or leave it out"
                 )
-        for modality in self.planned_modalities:
-            if self.normalization_mapping.get(modality) is not NormalizationMode.MIN_MAX:
-                raise ParsingError(f"what is planned lies in [-1, 1]: normalization_mapping needs {modality}: MIN_MAX")
         if self.num_inference_steps > self.num_train_timesteps:
             raise ParsingError(
                 f"num_inference_steps={self.num_inference_steps} is more than {self.num_train_timesteps=}, the number "

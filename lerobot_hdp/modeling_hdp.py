@@ -49,12 +49,13 @@ def _without_dropout[**P, R](method: Callable[P, R]) -> Callable[P, R]:
     @wraps(method)
     def in_eval_mode(*args: P.args, **kwargs: P.kwargs) -> R:
         network: nn.Module = args[0]._planning_network  # type: ignore[attr-defined]
-        was_training = network.training
+        if not network.training:
+            return method(*args, **kwargs)
         network.eval()
         try:
             return method(*args, **kwargs)
         finally:
-            network.train(was_training)
+            network.train()
 
     return in_eval_mode
 
@@ -216,7 +217,7 @@ class HDPPolicy(PreTrainedPolicy):
             self.ema.update(self.planner)
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Algorithm 1: corrupt motion and symbols independently, denoise both, L = L_DDPM + lambda L_MD4.
+        """The loss of Algorithm 1, see `training_loss`.
 
         Args:
             batch: preprocessed observations, `action` (B, H_c, D) and `observation.symbolic_plan` (B, H_d).

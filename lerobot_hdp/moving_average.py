@@ -34,8 +34,7 @@ class MovingAverage(nn.Module):
 
     def train(self, mode: bool = True) -> "MovingAverage":
         """The averaged network only plans: it has no dropout, whatever the policy that holds it does."""
-        super().train(mode)
-        self.module.eval()
+        self.training = mode
         return self
 
     @property

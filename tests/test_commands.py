@@ -19,6 +19,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_edit_dataset, lerobot_eval, lerobot_train
 from safetensors.torch import load_file
 
+from gym_hdp_tasks.env_config import HDPEnv
 from lerobot_hdp import HDPConfig, Vocabulary
 from lerobot_hdp.scripts import hdp_plan, hdp_train
 
@@ -319,6 +320,13 @@ def test_hdp_plan_explains_a_dataset_without_symbols_and_without_a_task(checkpoi
 def test_hdp_plan_does_not_plan_for_a_page_that_it_cannot_write(checkpoint, tmp_path):
     with pytest.raises(SystemExit, match=r"^hdp-plan: .* is a folder: name a file in it"):
         call_command(hdp_plan.main, f"--policy.path={checkpoint}", f"--html={tmp_path}")
+
+
+def test_hdp_plan_compiles_a_planner_only_if_it_is_told_to(make_planner, tmp_path, monkeypatch):
+    make_planner(compile_model=True)[0].save_pretrained(tmp_path)
+    for flags, compiles in (((), False), (("--policy.compile_model=true",), True)):
+        monkeypatch.setattr(sys, "argv", ["hdp-plan", f"--policy.path={tmp_path}", *flags])
+        assert hdp_plan.PlanConfig(env=HDPEnv()).policy.compile_model == compiles
 
 
 def test_hdp_plan_executes_a_plan_that_is_shorter_than_the_episode(make_planner, tmp_path, capsys):

@@ -79,6 +79,8 @@ class PlanConfig:
         overrides = parser.get_cli_overrides("policy") or []
         self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         self.policy.pretrained_path = Path(path)
+        if not any(override.startswith("--compile_model") for override in overrides):
+            self.policy.compile_model = False  # it takes longer than a plan
         missing = self.env is None or (self.explain is not None and self.dataset is None)
         if missing and (trained := _train_config(path, self.policy.pretrained_revision)):
             self.env = self.env or trained.env
