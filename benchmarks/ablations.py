@@ -206,8 +206,9 @@ seeds). Then training twice as long pays: of the last five evaluations, all plan
 more in the others. It does not help Separate: 68 of 100 plans are valid with it, and 67 to 76 without (three seeds). In
 tool use, HDP has 100 % with it as without; in arranging, from 4,000 demonstrations, 94 % where it has 98 and 99 without
 (two seeds), and fails by its plan alone: which slot another block leaves no room to reach may be a matter of
-centimetres. So no preset has it. (All that has noise or weight decay was trained in float32, the others in bfloat16, which made waypoints and poses
-coarser than it does now. `dtype=float32` is that alone: it gains nothing, and 86 of 100 plans are valid with it.)
+centimetres. So no preset has it. (All that has noise or weight decay was trained in float32, the others in bfloat16,
+which made waypoints and poses coarser than it does now. `dtype=float32` is that alone: it gains nothing, and 86 of 100
+plans are valid with it.)
 
 """
 ABOUT_DIFFUSER = """
