@@ -54,8 +54,8 @@ WHAT_THE_SETTINGS_ARE = """\
 - Muon (`--policy.optimizer_type=muon`) updates all matrices of one shape together.
 - Attention is PyTorch's `scaled_dot_product_attention`, with the kernel that PyTorch chooses.
 
-The dataset stays in the host's memory. The host waits for the device three times a step: for the losses in the log, and
-in LeRobot's loop for the loss and for the norm of the gradient.
+The dataset stays in the host's memory. Once a batch is on the device, the host waits for it three times a step: for the
+losses in the log, and in LeRobot's loop for the loss and for the norm of the gradient.
 """
 
 
