@@ -107,8 +107,10 @@ class SymbolStream(Stream):
     def __post_init__(self):
         super().__post_init__()
         self.draws_tokens = isinstance(self.process, MaskedProcess)
-        nothing = self.value.new_zeros(self.value.shape if self.draws_tokens else (len(self.value), 0))
-        self.token_probabilities = (self.given if self.given is not None and self.draws_tokens else nothing).float()
+        shape = self.value.shape if self.draws_tokens else (len(self.value), 0)
+        self.token_probabilities = torch.zeros(shape, device=self.value.device)
+        if self.draws_tokens and self.given is not None:
+            self.token_probabilities = self.given.float()
 
     @property
     def tokens(self) -> Tensor:
