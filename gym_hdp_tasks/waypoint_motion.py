@@ -77,7 +77,7 @@ class WaypointMotion:
         """Start from rest at a waypoint: (4,) x, y, z in metres and opening -> (7,) joint angles in radians."""
         self._configuration.update(self._home)
         self._waypoint = np.array(waypoint, dtype=np.float64)
-        self._joints = self._inverse_kinematics(self._waypoint[:3])
+        self._joints, _ = self._inverse_kinematics(self._waypoint[:3])
         return self._joints
 
     def hold(self) -> np.ndarray:
@@ -95,8 +95,8 @@ class WaypointMotion:
             the speed limits.
         """
         start, start_joints = self._waypoint, self._joints
-        middle_joints = self._inverse_kinematics((start[:3] + waypoint[:3]) / 2)
-        end_joints = self._inverse_kinematics(waypoint[:3])
+        middle_joints, _ = self._inverse_kinematics((start[:3] + waypoint[:3]) / 2)
+        end_joints, solved = self._inverse_kinematics(waypoint[:3])
 
         # q(s) = start + slope s + curvature s^2 goes through the three joint positions at s = 0, 1/2, 1.
         curvature = 2 * (start_joints + end_joints - 2 * middle_joints)
@@ -117,7 +117,11 @@ class WaypointMotion:
 
         self._joints = joints[-1]
         self._waypoint = np.append(start[:3] + reached * (waypoint[:3] - start[:3]), waypoint[3])
-        return controls, reached == 1.0
+        if reached < 1:  # the next inverse kinematics starts where the arm is, not where it should have been
+            stopped = self._configuration.q.copy()
+            stopped[self._arm_qpos] = self._joints
+            self._configuration.update(stopped)
+        return controls, solved and reached == 1.0
 
     def _controls(self, joints: np.ndarray, openings: np.ndarray) -> np.ndarray:
         controls = np.zeros((len(joints), self._n_actuators))
@@ -126,13 +130,13 @@ class WaypointMotion:
         controls[:, self._gripper_actuator] = closed + (opened - closed) * openings
         return controls
 
-    def _inverse_kinematics(self, position: np.ndarray) -> np.ndarray:
-        """Joint angles (7,) that bring the tool to a position (3,), starting from the last solution."""
+    def _inverse_kinematics(self, position: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Joint angles (7,) that bring the tool to a position (3,), from the last ones on, and whether they do."""
         self._tool.set_target(mink.SE3.from_rotation_and_translation(_GRIPPER_DOWN, position))
         for _ in range(_MAX_ITERATIONS):
             error = self._tool.compute_error(self._configuration)
             if np.linalg.norm(error[:3]) < _POSITION_TOLERANCE and np.linalg.norm(error[3:]) < _ROTATION_TOLERANCE:
-                break
+                return self._configuration.q[self._arm_qpos].copy(), True
             velocity = mink.solve_ik(
                 self._configuration,
                 [self._tool, self._posture],
@@ -142,7 +146,7 @@ class WaypointMotion:
                 limits=self._limits,
             )
             self._configuration.integrate_inplace(velocity, 1.0)
-        return self._configuration.q[self._arm_qpos].copy()
+        return self._configuration.q[self._arm_qpos].copy(), False
 
 
 def _joint_inertias(model: mujoco.MjModel, configuration: np.ndarray) -> np.ndarray:

@@ -215,6 +215,29 @@ def test_a_waypoint_too_far_for_one_step_is_reported_and_reached_later():
     assert np.linalg.norm(env.tool_position() - across[:3]) < 0.002
 
 
+def test_after_a_move_that_was_cut_short_the_arm_goes_on_from_where_it_is():
+    """Not from where it should have been: the arm would reach for the far corner around the back of its base."""
+    env = make("hdp/XArmArrangeBlocks-v0")
+    env.reset(seed=0)
+    near, far = WORKSPACE_LOW * [1, -1, 1], WORKSPACE_HIGH
+    env.step(np.array([far[0], far[1], near[2], 1.0]))
+    *_, info = env.step(np.array([near[0], -near[1], near[2], 1.0]))
+    assert info["action_clipped"]
+    for _ in range(3):
+        *_, info = env.step(np.array([*far, 1.0]))
+        assert abs(env.data.joint("joint1").qpos[0]) < 1
+    assert not info["action_clipped"]
+    assert np.linalg.norm(env.tool_position() - far) < 0.002
+
+
+def test_what_the_arm_cannot_reach_inside_the_workspace_is_reported():
+    env = make("hdp/XArmArrangeBlocks-v0")
+    env.action_space = gym.spaces.Box(env.action_space.low, np.float32(2))
+    env.reset(seed=0)
+    clipped = [env.step(np.array([0.8, 0.0, 0.2, 1.0]))[-1]["action_clipped"] for _ in range(8)]
+    assert all(clipped)
+
+
 @pytest.mark.parametrize(
     "parameters",
     [
@@ -314,10 +337,15 @@ def assert_stable(env):
 
 @pytest.mark.parametrize(("gym_id", "num_actions"), [(IDS[0], 400), (IDS[1], 200), (IDS[2], 200)])
 def test_random_actions_leave_the_simulation_stable(gym_id, num_actions):
+    """Every second number of an action is at the edge of the workspace, where the ways are long."""
     env, rng = make(gym_id), np.random.default_rng(0)
+    low, high = env.action_space.low, env.action_space.high
     env.reset(seed=0)
     for step in range(num_actions):
-        env.step(rng.uniform(env.action_space.low, env.action_space.high))
+        env.step(rng.uniform(low - (high - low) / 2, high + (high - low) / 2))
+        assert (env.tool_position() > WORKSPACE_LOW - 0.05).all()
+        assert (env.tool_position() < WORKSPACE_HIGH + 0.05).all()
+        assert abs(env.data.joint("joint1").qpos[0]) < np.pi / 2
         if step % 100 == 0:
             assert_stable(env)
             env.reset()
