@@ -11,19 +11,24 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+TERMINATION = (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
+"""Signals that tell a process to stop; Windows has no SIGHUP, which comes when a terminal or a connection is gone."""
+
 
 def exit_when_terminated() -> None:
-    """Leave by an exception on SIGTERM, as Python does on Ctrl-C."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("terminated; the same command with --resume=true goes on"))
+    """Leave by an exception when told to stop, as Python does on Ctrl-C; what is ignored (`nohup`) stays ignored."""
+    for number in TERMINATION:
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, lambda *_: sys.exit("terminated; the same command with --resume=true goes on"))
 
 
 @contextmanager
 def deferred_signals() -> Iterator[list[int]]:
-    """Let SIGTERM and Ctrl-C wait for the end of a block, which gets the list of those that have arrived.
+    """Let Ctrl-C and what tells to stop wait for the end of a block, which gets the list of those that have arrived.
 
     In another thread than the main one, which no signal interrupts, the list stays empty.
     """
-    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    numbers = (signal.SIGINT, *TERMINATION) if threading.current_thread() is threading.main_thread() else ()
     handlers = {number: handler for number in numbers if (handler := signal.getsignal(number)) != signal.SIG_IGN}
     arrived: list[int] = []
     for number in handlers:

@@ -275,7 +275,7 @@ def attempt_episodes(config: RecordConfig, episodes: range) -> Iterator[tuple[in
 def record_shard(config: RecordConfig, shard: Shard, progress: tqdm | None = None) -> None:
     """Record a shard, or what is missing of it.
 
-    SIGTERM and Ctrl-C wait for the episode that is recorded; after SIGKILL, the shard begins again.
+    SIGTERM, SIGHUP and Ctrl-C wait for the episode that is recorded; after SIGKILL, the shard begins again.
 
     Raises:
         BlockingIOError: another process records it.

@@ -26,7 +26,7 @@ from dataset_tools import record as recorder
 from dataset_tools import record_on_cluster as cluster
 from dataset_tools.demonstration import Demonstration
 from dataset_tools.experts import EXPERTS
-from dataset_tools.interruption import one_process
+from dataset_tools.interruption import TERMINATION, one_process
 from dataset_tools.record import (
     RECORDING_PATH,
     RecordConfig,
@@ -334,8 +334,19 @@ def test_an_interrupted_recording_goes_on_with_the_same_settings_only(tmp_path):
             record(replace(other, resume=True))
 
 
+@pytest.fixture
+def not_ignored():
+    """What tells a process to stop does so, also under `nohup`; as before afterwards."""
+    handlers = {number: signal.signal(number, signal.SIG_DFL) for number in TERMINATION}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("not_ignored")
 @pytest.mark.parametrize(
-    ("signal_number", "exception"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
+    ("signal_number", "exception"),
+    [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit), (signal.SIGHUP, SystemExit)],
 )
 def test_a_signal_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch, signal_number, exception):
     monkeypatch.setattr(recorder, "FEWEST_SHARDS", 1)
@@ -346,17 +357,20 @@ def test_a_signal_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch
             signal.raise_signal(signal_number)
         save_episode(dataset)
 
-    handler = signal.getsignal(signal.SIGTERM)
     recorder.exit_when_terminated()
-    try:
-        with monkeypatch.context() as patch:
-            patch.setattr(LeRobotDataset, "save_episode", save_while_the_signal_comes)
-            with pytest.raises(exception):
-                record(config)
-    finally:
-        signal.signal(signal.SIGTERM, handler)
+    with monkeypatch.context() as patch:
+        patch.setattr(LeRobotDataset, "save_episode", save_while_the_signal_comes)
+        with pytest.raises(exception):
+            record(config)
     assert load_info(tmp_path / "stopped.partial/episodes_000000").total_episodes == 3
     assert record(replace(config, resume=True)).num_episodes == 5
+
+
+@pytest.mark.usefixtures("not_ignored")
+def test_under_nohup_a_recording_outlives_its_terminal():
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    recorder.exit_when_terminated()
+    signal.raise_signal(signal.SIGHUP)
 
 
 @pytest.fixture
