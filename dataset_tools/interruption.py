@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import ModuleType
 
 from filelock import FileLock, Timeout
 
@@ -66,14 +67,18 @@ def one_process(lock_file: Path, work: str) -> Iterator[None]:
         lock.release()
 
 
-def when_parent_ends(action: Callable[[], None]) -> None:
+def when_parent_ends(action: Callable[[], None], library: ModuleType = multiprocessing) -> None:
     """Do something as soon as the process that asked for this one is gone, even if it was killed.
 
     A child of a fork server would outlive it.
+
+    Args:
+        action: what to do.
+        library: `multiprocessing`, or what was used in its place to start this process.
     """
 
     def wait() -> None:
-        parent = multiprocessing.parent_process()
+        parent = library.parent_process()
         assert parent is not None
         parent.join()
         action()
@@ -81,7 +86,7 @@ def when_parent_ends(action: Callable[[], None]) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def end_with_parent() -> None:
+def end_with_parent(library: ModuleType = multiprocessing) -> None:
     """Get SIGTERM when the parent is gone; leave Ctrl-C to it, as a terminal sends that to both."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    when_parent_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    when_parent_ends(lambda: os.kill(os.getpid(), signal.SIGTERM), library)

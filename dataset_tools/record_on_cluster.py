@@ -14,15 +14,16 @@ folder must be one that all machines see; the engine's logs are written beside i
 import os
 import sys
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import multiprocess
 from datatrove.executor import LocalPipelineExecutor, SlurmPipelineExecutor
 from draccus.utils import ParsingError
 from lerobot.configs import parser
 
-from .interruption import one_process
+from .interruption import end_with_parent, exit_when_terminated, one_process
 from .record import (
     RecordConfig,
     Shard,
@@ -58,8 +59,17 @@ class ClusterRecordConfig(RecordConfig):
     resume: bool = True
 
 
-def record_task(config: RecordConfig, shards: list[Shard], _: Any, rank: int, world_size: int) -> None:
+@cache
+def _end_with_engine() -> None:
+    """In a worker on the engine's machine, once, as it may do many tasks; the engine's own process is none."""
+    if multiprocess.parent_process() is not None:
+        end_with_parent(multiprocess)
+
+
+def record_task(config: ClusterRecordConfig, shards: list[Shard], _: Any, rank: int, world_size: int) -> None:
     """One of `world_size` tasks of the engine."""
+    if config.slurm.partition is None:
+        _end_with_engine()
     for shard in shards[rank::world_size]:
         record_shard(config, shard)
 
@@ -119,9 +129,12 @@ def _main(config: ClusterRecordConfig) -> None:
 
 def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    exit_when_terminated()
     try:
         accept_env_type()
         _main()
+    except KeyboardInterrupt:
+        sys.exit("record_on_cluster: interrupted; the same command goes on")
     except (ParsingError, ValueError, OSError, ImportError) as error:
         sys.exit(f"record_on_cluster: {error}")
 

@@ -1,5 +1,6 @@
 """`hdp-record`: the data contract, interruptions, and what cannot be recorded."""
 
+import contextlib
 import itertools
 import json
 import os
@@ -149,13 +150,40 @@ def test_the_command_records_the_same_dataset_with_two_processes(dataset_root, t
         assert json.loads((root / file).read_text()) == json.loads((dataset_root / file).read_text())
 
 
-def test_a_cluster_engine_records_the_same_dataset(dataset_root, tmp_path):
+def test_a_cluster_engine_records_the_same_dataset_also_when_it_was_killed(dataset_root, tmp_path, monkeypatch):
     root = tmp_path / "cluster"
     flags = ("--dataset.repo_id=test/sorting", f"--dataset.root={root}", f"--dataset.num_episodes={N_EPISODES}")
-    module = ("-m", "dataset_tools.record_on_cluster")
-    run_command("python", *module, "--env.type", "hdp", *TASK_FLAGS, *flags, "--num_workers=2")
+    command = ("-m", "dataset_tools.record_on_cluster", "--env.type", "hdp", *TASK_FLAGS, *flags)
+    process = subprocess.Popen([sys.executable, *command, "--num_workers=2"], stderr=subprocess.DEVNULL)
+    while not list(tmp_path.glob("cluster.partial/*.done")):
+        assert process.poll() is None
+        time.sleep(0.01)
+    servers = psutil.Process(process.pid).children()
+    workers = [worker for server in servers for worker in server.children()]
+    process.kill()
+    _, still_running = psutil.wait_procs(workers, timeout=20)
+    assert len(workers) == 2
+    assert not still_running
+    for server in servers:  # one of them, which does nothing, outlives the engine
+        with contextlib.suppress(psutil.NoSuchProcess):
+            server.kill()
+    assert not root.exists()
+    monkeypatch.setattr(cluster, "exit_when_terminated", lambda: None)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    call_command(cluster.main, *command[2:])
     assert_same_dataset(dataset_root, root)
     assert not root.with_name("cluster.partial").exists()
+
+
+def test_a_cluster_engine_that_is_interrupted_says_what_goes_on(tmp_path, monkeypatch):
+    def interrupted(env, rng):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(EXPERTS, "hdp/BlockSorting2D-v0", interrupted)
+    monkeypatch.setattr(cluster, "exit_when_terminated", lambda: None)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    with pytest.raises(SystemExit, match="record_on_cluster: interrupted; the same command goes on"):
+        call_command(cluster.main, *flags_of(2, tmp_path / "stopped"))
 
 
 def test_a_slurm_job_records_a_shard(tmp_path, monkeypatch):
@@ -177,7 +205,7 @@ def test_a_slurm_job_records_a_shard(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("module", [recorder, cluster])
 def test_environments_that_are_not_of_this_package_cannot_be_recorded(monkeypatch, module):
-    monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
+    monkeypatch.setattr(module, "exit_when_terminated", lambda: None)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     with pytest.raises(SystemExit, match=r"--env.type=aloha has no experts, only --env.type=hdp has$"):
         call_command(module.main, "--dataset.repo_id=t/t", "--env.type=aloha")
