@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,7 +49,7 @@ import gym_hdp_tasks  # noqa: F401 (registers the tasks)
 from gym_hdp_tasks import PlanningTask
 from gym_hdp_tasks.env_config import HDPEnv
 
-from .demonstration import Expert, check_steps, expert_generator
+from .demonstration import Demonstration, Expert, check_steps, expert_generator
 from .experts import EXPERTS
 from .interruption import deferred_signals, end_with_parent, exit_when_terminated, one_process
 from .language import SYMBOLIC_PLAN, write_language_columns
@@ -185,9 +186,7 @@ def demonstrate(env: gym.Env, expert: Expert, seed: int, features_map: dict[str,
     observation, _ = env.reset(seed=seed)
     demonstration = expert(env, expert_generator(seed))
     task: PlanningTask = env.unwrapped.planning_task  # type: ignore[attr-defined]
-    if len(demonstration.waypoints) != task.horizon:
-        raise ValueError(f"the expert has {len(demonstration.waypoints)} waypoints, {task.gym_id} {task.horizon}")
-    check_steps(demonstration.steps, task.horizon, "the expert's plan")
+    _check_demonstration(demonstration, task, observation)
     frames = []
     for frame, action in enumerate(demonstration.waypoints):
         next_observation, score, terminated, truncated, info = env.step(action)
@@ -204,6 +203,22 @@ def demonstrate(env: gym.Env, expert: Expert, seed: int, features_map: dict[str,
         observation = next_observation
     columns = {key: np.stack([frame[key] for frame in frames]) for key in frames[0]}
     return Episode(columns)
+
+
+def _check_demonstration(demonstration: Demonstration, task: PlanningTask, observation: dict[str, Any]) -> None:
+    """Whether an expert's waypoints and its plan can be those of a task; its words only where poses are observed."""
+    if len(demonstration.waypoints) != task.horizon:
+        raise ValueError(f"the expert has {len(demonstration.waypoints)} waypoints, {task.gym_id} {task.horizon}")
+    check_steps(demonstration.steps, task.horizon, "the expert's plan")
+    demonstration.remaining_token_ids(0, task.vocabulary, task.symbolic_horizon)
+    tokens = accumulate(len(step.symbols) for step in demonstration.steps)
+    ends = tuple(zip(tokens, [step.stop for step in demonstration.steps], strict=True))
+    if task.step_ends is not None and ends != task.step_ends[: len(ends)]:
+        raise ValueError(f"the steps of the expert's plan end at {ends}, those of {task.gym_id} at {task.step_ends}")
+    if "environment_state" in observation:
+        complaints = task.check_plan(demonstration.remaining_symbols(0), observation)
+        if complaints:
+            raise ValueError(f"the expert's plan is none of {task.gym_id}: {'; '.join(complaints)}")
 
 
 def _entry(observation: dict[str, Any], key: str) -> np.ndarray:

@@ -34,9 +34,10 @@ class PlanningTask:
         action_names: components of `action`.
         fps: actions per second.
         robot_type: what LeRobot writes into the dataset's `robot_type`.
-        step_ends: (tokens, waypoints) of a demonstration up to the end of each step: the first step is the tokens 0 to
-            step_ends[0][0] - 1 and the waypoints 0 to step_ends[0][1] - 1. Every demonstration keeps this time.
         check_plan: (symbols without PAD, observation) -> what is wrong with the plan, in words.
+        step_ends: (tokens, waypoints) of a demonstration up to the end of each step: the first step is the tokens 0 to
+            step_ends[0][0] - 1 and the waypoints 0 to step_ends[0][1] - 1. Every demonstration keeps this time. None:
+            each has its own.
     """
 
     gym_id: str
@@ -49,8 +50,8 @@ class PlanningTask:
     action_names: tuple[str, ...]
     fps: int
     robot_type: str
-    step_ends: tuple[tuple[int, int], ...]
     check_plan: Callable[[Sequence[str], Observation], list[str]] = field(compare=False)
+    step_ends: tuple[tuple[int, int], ...] | None = None
     parameters: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):

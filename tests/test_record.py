@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import psutil
 import pytest
@@ -32,6 +33,7 @@ from dataset_tools.record import (
     RECORDING_PATH,
     RecordConfig,
     RecordDatasetConfig,
+    demonstrate,
     episode_seed,
     plan_shards,
     record,
@@ -505,6 +507,14 @@ def with_step(demonstration: Demonstration, **changes) -> Demonstration:
             f"{HORIZON - 1} waypoints, hdp/BlockSorting2D-v0 {HORIZON}",
         ),
         (lambda it: with_step(it, stop=99), "the stops of the expert's plan must strictly increase within 1..19"),
+        (
+            lambda it: with_step(it, stop=18),
+            r"end at \(\(6, 7\), \(12, 13\), \(18, 18\)\), those of hdp/BlockSorting2D-v0 at",
+        ),
+        (
+            lambda it: with_step(it, symbols=("PICK", "A", "S1", "PLACE", "A", "S1")),
+            "plan is none of .*: move 3 picks A",
+        ),
         (lambda it: with_step(it, symbols=("PICK", "C")), "the vocabulary PAD A B PICK PLACE S1 S2 AUX has no C"),
         (lambda it: with_step(it, symbols=("PICK",) * 9), "a plan of 21 symbols does not fit a symbolic horizon of 18"),
     ],
@@ -514,6 +524,16 @@ def test_an_expert_that_does_not_do_the_task_is_an_error(tmp_path, monkeypatch, 
     monkeypatch.setitem(EXPERTS, "hdp/BlockSorting2D-v0", lambda env, rng: change(expert(env, rng)))
     with pytest.raises(ValueError, match=message):
         record(config_of(2, tmp_path / "useless"))
+
+
+def test_the_steps_of_a_task_that_states_no_time_end_when_the_expert_says():
+    env = gym.make("hdp/BlockSorting2D-v0", disable_env_checker=True, n_blocks=2, waypoints_per_pose=1).unwrapped
+    env.planning_task = replace(env.planning_task, step_ends=None)
+    expert = EXPERTS["hdp/BlockSorting2D-v0"]
+    later = demonstrate(env, lambda env, rng: with_step(expert(env, rng), stop=18), 0, HDPEnv().features_map)
+    left = (later.columns["observation.symbolic_plan"] != 0).sum(axis=1)
+    assert later.succeeded
+    assert left.tolist() == [18] * 7 + [12] * 6 + [6] * 5 + [0]
 
 
 def test_a_task_without_an_expert_is_not_recorded(tmp_path, monkeypatch):
