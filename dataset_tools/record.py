@@ -96,7 +96,7 @@ class RecordConfig:
 
     Attributes:
         dataset: what is recorded and where it goes.
-        env: the task, as for `lerobot-eval`; `--env.obs_type=pixels_state` records its cameras too.
+        env: the task, as for `lerobot-eval`; `--env.obs_type=pixels_agent_pos` records cameras in place of poses.
         seed: every start and every choice of the expert follow from it.
         num_workers: processes that record.
         resume: go on with a recording that was interrupted, or whose upload failed.

@@ -40,7 +40,7 @@ class HDPEnv(EnvConfig):
         waypoints_per_pose: waypoints between two key poses of the expert, which sets the episode's length
             (BlockSorting2D only).
         robot: `primitive`, or `menagerie` for MuJoCo Menagerie's model (X-Arm tasks only).
-        obs_type: `state`, `pixels` or `pixels_state` (X-Arm tasks only).
+        obs_type: `state`, `pixels`, `pixels_agent_pos` or `pixels_state` (X-Arm tasks only).
         camera_name: the cameras to observe: `front`, `wrist`, or `front,wrist` (X-Arm tasks only).
         observation_height: of an observed image, in pixels (X-Arm tasks only).
         observation_width: likewise.
@@ -68,36 +68,40 @@ class HDPEnv(EnvConfig):
             check_image_size(self.observation_height, self.observation_width)
         except ValueError as error:  # LeRobot's commands show the message of draccus' own error only
             raise ParsingError(str(error)) from error
-        for name, choices in (("robot", ROBOTS), ("obs_type", OBS_TYPES), ("render_mode", RENDER_MODES)):
+        for name, choices in (("robot", ROBOTS), ("obs_type", tuple(OBS_TYPES)), ("render_mode", RENDER_MODES)):
             if getattr(self, name) not in choices:
                 raise ParsingError(f"--env.{name} must be one of {choices}, got {getattr(self, name)!r}")
         self.camera_name = ",".join(cameras)
+        observed = OBS_TYPES[self.obs_type]
         others = set(TASK_PARAMETERS).difference(self._task_parameters) | set(() if self._has_robot else XARM_ONLY)
         for field in fields(self):
             if getattr(self, field.name) == field.default:
                 continue
             if field.name in others:
                 raise ParsingError(f"--env.{field.name} must be left out, {self.task} does not have it")
-            if field.name in IMAGES_ONLY and self.obs_type == "state":
-                raise ParsingError(f"--env.{field.name} is of images: add --env.obs_type=pixels, or pixels_state")
+            if field.name in IMAGES_ONLY and "pixels" not in observed:
+                advice = "add --env.obs_type=pixels, pixels_agent_pos or pixels_state"
+                raise ParsingError(f"--env.{field.name} is of images: {advice}")
         if self.fps not in (EnvConfig.fps, task.fps):
             raise ParsingError(f"--env.fps must be left out, it is {task.fps} for {self.task}")
         self.fps = task.fps
         self.features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(task.action_names),))}
         self.features_map = {ACTION: ACTION}
-        if self.obs_type != "pixels":
-            state = PolicyFeature(type=FeatureType.STATE, shape=(len(task.state_names),))
+        if "agent_pos" in observed:
+            self.features["agent_pos"] = PolicyFeature(type=FeatureType.STATE, shape=(len(task.state_names),))
+            self.features_map["agent_pos"] = OBS_STATE
+        if "environment_state" in observed:
             poses = PolicyFeature(type=FeatureType.ENV, shape=(len(task.environment_state_names),))
-            self.features |= {"agent_pos": state, "environment_state": poses}
-            self.features_map |= {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
-        if self.obs_type != "state":
+            self.features["environment_state"] = poses
+            self.features_map["environment_state"] = OBS_ENV_STATE
+        if "pixels" in observed:
             image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.observation_height, self.observation_width, 3))
             self.features |= {f"pixels/{camera}": image for camera in cameras}
             self.features_map |= {f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in cameras}
 
     def with_poses(self) -> "HDPEnv":
         """The same, where the objects' poses are observed, too: the task's checker of plans looks at them."""
-        return replace(self, obs_type="pixels_state") if self.obs_type == "pixels" else self
+        return self if "environment_state" in OBS_TYPES[self.obs_type] else replace(self, obs_type="pixels_state")
 
     @property
     def planning_task(self) -> PlanningTask:

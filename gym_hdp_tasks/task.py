@@ -9,8 +9,14 @@ import numpy as np
 from .plan_rules import Observation
 
 FRONT_CAMERA, WRIST_CAMERA = CAMERAS = ("front", "wrist")
-OBS_TYPES = ("state", "pixels", "pixels_state")
-"""What an X-Arm task can observe, and by which cameras."""
+"""By which an X-Arm task can observe."""
+OBS_TYPES = {
+    "state": ("agent_pos", "environment_state"),
+    "pixels": ("pixels",),
+    "pixels_agent_pos": ("pixels", "agent_pos"),
+    "pixels_state": ("pixels", "agent_pos", "environment_state"),
+}
+"""What an X-Arm task can observe, to keys of the observation; `pixels` and `pixels_agent_pos` are LeRobot's names."""
 ROBOTS = ("primitive", "menagerie")
 """`primitive` ships with this package; `menagerie` is MuJoCo Menagerie's `ufactory_xarm7` (extra `menagerie`)."""
 RENDER_MODES = ("rgb_array",)

@@ -41,7 +41,8 @@ class XArmEnv(gym.Env):
 
     Observation, by `obs_type`: `state` has `agent_pos` (4,), the tool's measured position and opening, and
     `environment_state` (7 n,), x, y, z and a unit quaternion (w, x, y, z) of each object; `pixels` has a dictionary
-    `pixels` of one (height, width, 3) uint8 image per camera; `pixels_state` has all three.
+    `pixels` of one (height, width, 3) uint8 image per camera; `pixels_agent_pos` has these and `agent_pos`;
+    `pixels_state` has all three.
 
     An episode lasts `planning_task.horizon` steps. The reward is 0 until the last one, then the score in [0, 1];
     `info["is_success"]` says whether that is 1. `info["action_clipped"]` says that the waypoint lay outside the
@@ -81,7 +82,7 @@ class XArmEnv(gym.Env):
         render_mode: str | None = None,
     ):
         if obs_type not in OBS_TYPES:
-            raise ValueError(f"obs_type must be one of {OBS_TYPES}, got {obs_type!r}")
+            raise ValueError(f"obs_type must be one of {tuple(OBS_TYPES)}, got {obs_type!r}")
         check_image_size(observation_height, observation_width)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -293,21 +294,25 @@ class XArmEnv(gym.Env):
             return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
         spaces: dict[str, gym.Space] = {}
-        if self.obs_type != "pixels":
+        observed = OBS_TYPES[self.obs_type]
+        if "agent_pos" in observed:
             spaces["agent_pos"] = unbounded(len(STATE_NAMES))
+        if "environment_state" in observed:
             spaces["environment_state"] = unbounded(len(POSE_NAMES) * len(self.object_names))
-        if self.obs_type != "state":
+        if "pixels" in observed:
             image = gym.spaces.Box(0, 255, (*self.camera_size, 3), np.uint8)
             spaces["pixels"] = gym.spaces.Dict(dict.fromkeys(self.camera_names, image))
         return spaces
 
     def _observation(self) -> dict[str, Any]:
         observation: dict[str, Any] = {}
-        if self.obs_type != "pixels":
+        observed = OBS_TYPES[self.obs_type]
+        if "agent_pos" in observed:
             agent_pos = [*self.tool_position(), self.gripper_opening()]
             observation["agent_pos"] = np.array(agent_pos, dtype=np.float32)
+        if "environment_state" in observed:
             observation["environment_state"] = self.object_poses().flatten().astype(np.float32)
-        if self.obs_type != "state":
+        if "pixels" in observed:
             # Without a GPU, shadows would take most of the time of an episode.
             observation["pixels"] = {
                 name: self._image(name, *self.camera_size, shadows=False) for name in self.camera_names

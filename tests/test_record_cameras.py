@@ -75,9 +75,9 @@ def test_a_video_shows_what_the_environment_showed(dataset):
 
 
 def test_images_can_be_kept_without_loss(tmp_path):
-    pixels = HDPEnv(task=ARRANGE.task, obs_type="pixels", observation_height=40, observation_width=48)
+    pixels = HDPEnv(task=ARRANGE.task, obs_type="pixels_agent_pos", observation_height=40, observation_width=48)
     dataset = record(config(tmp_path / "images", pixels, num_episodes=1, video=False))
-    assert not {"observation.state", "observation.environment_state"} & set(dataset.features)
+    assert {"observation.state", "observation.environment_state"} & set(dataset.features) == {"observation.state"}
     env = gym.make(pixels.gym_id, disable_env_checker=True, **pixels.gym_kwargs)
     observation, _ = env.reset(seed=episode_seed(0, 0))
     for name in IMAGES:

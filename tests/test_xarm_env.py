@@ -46,7 +46,8 @@ def test_gymnasium_finds_nothing_wrong(gym_id, obs_type):
     check_env(env, skip_render_check=obs_type != "state")
     observation, _ = env.reset(seed=0)
     assert ("pixels" in observation) == (obs_type != "state")
-    assert ("environment_state" in observation) == (obs_type != "pixels")
+    assert ("agent_pos" in observation) == (obs_type != "pixels")
+    assert ("environment_state" in observation) == (obs_type in ("state", "pixels_state"))
     env.close()
 
 
