@@ -52,7 +52,7 @@ def test_a_policy_finds_the_columns_of_the_environment_under_its_own_names(datas
     recorded = dataset_to_policy_features(dataset.meta.features)
     for name, feature in env_to_policy_features(SORTING).items():
         assert tuple(recorded[name].shape) == tuple(feature.shape), name
-        assert recorded[name].type == feature.type or name == "observation.environment_state"
+        assert recorded[name].type == feature.type, name
 
 
 def test_a_video_shows_what_the_environment_showed(dataset):
