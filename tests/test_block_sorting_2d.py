@@ -6,12 +6,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from lerobot.envs.factory import make_env
 
 import gym_hdp_tasks  # noqa: F401
 from dataset_tools.demonstration import expert_generator
 from dataset_tools.experts import EXPERTS
 from dataset_tools.experts.cycle_sort import cycle_sort
 from gym_hdp_tasks.block_sorting_2d import GRASP_RADIUS, SLOT_HALF_SIZE
+from gym_hdp_tasks.env_config import HDPEnv
 
 TASK_ID = "hdp/BlockSorting2D-v0"
 
@@ -201,6 +203,31 @@ def test_works_in_a_vector_environment():
     assert observation["environment_state"].shape == (3, 4)
     observation, *_ = env.step(env.action_space.sample())
     assert observation["agent_pos"].shape == (3, 3)
+
+
+def test_an_episode_is_the_same_in_processes_of_its_own():
+    """As `lerobot-eval` runs it by default."""
+    seeds, env = [0, 1], make(2)
+    plans = []
+    for seed in seeds:
+        env.reset(seed=seed)
+        plans.append(EXPERTS[TASK_ID](env, expert_generator(seed)).waypoints)
+
+    def episode(use_async_envs):
+        config = HDPEnv(n_blocks=2, waypoints_per_pose=1)
+        envs = make_env(config, len(seeds), use_async_envs=use_async_envs)["hdp"][0]
+        poses, rewards = [envs.reset(seed=seeds)[0]["environment_state"].copy()], []
+        for actions in np.stack(plans, axis=1):
+            observation, reward, *_ = envs.step(actions)
+            poses.append(observation["environment_state"].copy())
+            rewards.append(reward.copy())
+        envs.close()
+        return np.array(poses), np.array(rewards)
+
+    (poses, rewards), (poses_in_processes, rewards_in_processes) = episode(False), episode(True)
+    assert (rewards[-1] == 1).all()
+    np.testing.assert_array_equal(rewards_in_processes, rewards)
+    np.testing.assert_array_equal(poses_in_processes, poses)
 
 
 def test_renders_the_blocks_where_they_are():
