@@ -44,12 +44,16 @@ def test_nothing_but_friction_holds_a_block():
     assert env.score() < 1.0
 
 
-def test_a_block_on_the_stack_counts_when_it_is_let_go():
+def test_a_block_on_the_stack_counts_when_it_is_let_go_and_the_hook_is_held_to_drag():
     env, demonstration = demonstrate("hdp/XArmToolUse-v0", 0)
-    scores = []
+    scores, holds_hook = [], []
     for action in demonstration.waypoints:
         env.step(action)
         scores.append(env.score())
+        holds_hook.append(env.touched_by_robot("hook"))
+    assert not holds_hook[0]
+    assert all(holds_hook[demonstration.steps[0].stop : demonstration.steps[1].stop])
+    assert not any(holds_hook[demonstration.steps[2].stop :])
     last_held = np.flatnonzero(demonstration.waypoints[:, 3] < 1)[-1]
     assert scores[last_held] == 2 / 3
     assert scores[-1] == 1.0
