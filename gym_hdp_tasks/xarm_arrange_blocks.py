@@ -76,12 +76,10 @@ class XArmArrangeBlocksEnv(XArmEnv):
     observations and arguments.
     """
 
+    facts = staticmethod(xarm_arrange_blocks_task)
     object_names = BLOCKS
     camera_position = np.array([1.10, 0.0, 0.62])
     camera_target = np.array([0.37, 0.0, 0.05])
-
-    def __init__(self, robot: str = "primitive", **kwargs: Any):
-        super().__init__(xarm_arrange_blocks_task(robot), robot=robot, **kwargs)
 
     def add_objects(self, spec: mujoco.MjSpec) -> None:
         for centre in SLOT_CENTRES:

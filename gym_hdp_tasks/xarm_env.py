@@ -49,7 +49,6 @@ class XArmEnv(gym.Env):
     workspace, or too far to be reached in one step.
 
     Args:
-        planning_task: the task's facts.
         robot: one of `ROBOTS`.
         obs_type: one of `OBS_TYPES`.
         camera_name: the cameras to observe, from `CAMERAS`: `front,wrist`, or a sequence of names.
@@ -73,7 +72,6 @@ class XArmEnv(gym.Env):
 
     def __init__(
         self,
-        planning_task: PlanningTask,
         robot: str = "primitive",
         obs_type: str = "state",
         camera_name: str | Sequence[str] = CAMERAS,
@@ -86,7 +84,7 @@ class XArmEnv(gym.Env):
         check_image_size(observation_height, observation_width)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        self.planning_task = planning_task
+        self.planning_task = planning_task = self.facts(robot)
         self.metadata = {**self.metadata, "render_fps": planning_task.fps}
         self.render_mode = render_mode
         self.obs_type = obs_type
@@ -128,6 +126,11 @@ class XArmEnv(gym.Env):
         return {**self.__dict__, "_renderers": {}}
 
     # What a task defines.
+
+    @staticmethod
+    def facts(robot: str) -> PlanningTask:
+        """The task's facts, for one of `ROBOTS`."""
+        raise NotImplementedError
 
     def add_objects(self, spec: mujoco.MjSpec) -> None:
         """Add the task's objects to the scene: a free body and joint for each of `object_names`."""

@@ -65,10 +65,8 @@ class XArmSortingEnv(XArmEnv):
     and arguments.
     """
 
+    facts = staticmethod(xarm_sorting_task)
     object_names = BLOCKS
-
-    def __init__(self, robot: str = "primitive", **kwargs: Any):
-        super().__init__(xarm_sorting_task(robot), robot=robot, **kwargs)
 
     def add_objects(self, spec: mujoco.MjSpec) -> None:
         for centre, colour in zip(SLOT_CENTRES, (*COLOURS, GREY), strict=True):

@@ -2,6 +2,7 @@
 them (paper, "Tool-use experiment" and "conditional plan coherence")."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -52,15 +53,12 @@ OPEN = -1
 """In a plan prompt: the planner decides this token."""
 
 
-def xarm_tool_use_task(robot: str = "primitive", gym_id: str = "hdp/XArmToolUse-v0") -> PlanningTask:
-    """The task's facts: the same for both variants, up to the id and the instruction."""
-    instruction = "Drag the 3 blocks within reach with the hook, then stack them on the target."
-    if gym_id == "hdp/XArmToolUseRedOnTop-v0":
-        instruction = "Drag the 3 blocks within reach with the hook, then stack them on the target, red on top."
+def xarm_tool_use_task(robot: str = "primitive") -> PlanningTask:
+    """The task's facts."""
     return PlanningTask(
-        gym_id=gym_id,
+        gym_id="hdp/XArmToolUse-v0",
         parameters={"robot": robot},
-        instruction=instruction,
+        instruction="Drag the 3 blocks within reach with the hook, then stack them on the target.",
         vocabulary=(PAD, *BLOCKS, "DRAG", "STACK"),
         horizon=HORIZON,
         symbolic_horizon=SYMBOLIC_HORIZON,
@@ -70,7 +68,17 @@ def xarm_tool_use_task(robot: str = "primitive", gym_id: str = "hdp/XArmToolUse-
         fps=FPS,
         robot_type="xarm7",
         step_ends=STEP_ENDS,
-        check_plan=partial(check_plan, top_block="RED" if gym_id == "hdp/XArmToolUseRedOnTop-v0" else None),
+        check_plan=check_plan,
+    )
+
+
+def xarm_tool_use_red_on_top_task(robot: str = "primitive") -> PlanningTask:
+    """The facts of the variant with a plan prompt, in which red is stacked last."""
+    return replace(
+        xarm_tool_use_task(robot),
+        gym_id="hdp/XArmToolUseRedOnTop-v0",
+        instruction="Drag the 3 blocks within reach with the hook, then stack them on the target, red on top.",
+        check_plan=partial(check_plan, top_block="RED"),
     )
 
 
@@ -98,11 +106,6 @@ def check_plan(symbols: Sequence[str], observation: Observation, top_block: str 
     return complaints
 
 
-def xarm_tool_use_red_on_top_task(robot: str = "primitive") -> PlanningTask:
-    """The facts of the variant with a plan prompt."""
-    return xarm_tool_use_task(robot, gym_id="hdp/XArmToolUseRedOnTop-v0")
-
-
 class XArmToolUseEnv(XArmEnv):
     """Three blocks out of reach, a hook within reach, and an area to stack the blocks on.
 
@@ -110,12 +113,10 @@ class XArmToolUseEnv(XArmEnv):
     stack) say what the stack looks like. See `XArmEnv` for actions, observations and arguments.
     """
 
+    facts = staticmethod(xarm_tool_use_task)
     object_names = (*BLOCKS, HOOK)
     camera_position = np.array([1.28, 0.0, 0.76])
     camera_target = np.array([0.45, 0.0, 0.03])
-
-    def __init__(self, robot: str = "primitive", **kwargs: Any):
-        super().__init__(xarm_tool_use_task(robot), robot=robot, **kwargs)
 
     def add_objects(self, spec: mujoco.MjSpec) -> None:
         add_slot(spec, TARGET, TARGET_HALF_SIZE, GREY)
@@ -172,8 +173,7 @@ class XArmToolUseRedOnTopEnv(XArmToolUseEnv):
     plan once. The score is 1 when all blocks are stacked and red is on top, else 0.
     """
 
-    def __init__(self, robot: str = "primitive", **kwargs: Any):
-        XArmEnv.__init__(self, xarm_tool_use_red_on_top_task(robot), robot=robot, **kwargs)
+    facts = staticmethod(xarm_tool_use_red_on_top_task)
 
     def score(self) -> float:
         """1 when all blocks are stacked with red on top, else 0."""
