@@ -121,7 +121,7 @@ class RecordConfig:
 
     @property
     def root(self) -> Path:
-        return Path(self.dataset.root or HF_LEROBOT_HOME / self.dataset.repo_id)
+        return Path(self.dataset.root or HF_LEROBOT_HOME / self.dataset.repo_id).resolve()
 
     @property
     def partial_root(self) -> Path:
@@ -329,9 +329,14 @@ def _record_missing_episodes(config: RecordConfig, shard: Shard, signals: list[i
         if writing or not dataset.meta.total_episodes:
             shutil.rmtree(shard.root)  # a half written episode may be in the data and not in the metadata
         else:
-            unfinished = shard.done_file.with_suffix(".unfinished")
-            unfinished.write_text(json.dumps(failed))
-            unfinished.replace(shard.done_file)  # at once, whatever interrupts
+            _write_whole(shard.done_file, json.dumps(failed))
+
+
+def _write_whole(file: Path, text: str) -> None:
+    """Write a file at once, whatever interrupts."""
+    unfinished = file.with_suffix(".unfinished")
+    unfinished.write_text(text)
+    unfinished.replace(file)
 
 
 def _open_shard(config: RecordConfig, shard: Shard) -> LeRobotDataset:
@@ -517,7 +522,12 @@ def try_environment(config: RecordConfig) -> None:
 
 
 def plan_shards(config: RecordConfig) -> list[Shard]:
-    """The shards of a recording, in a folder beside the dataset's that remembers the settings."""
+    """The shards of a recording, in a folder beside the dataset's that remembers the settings.
+
+    Raises:
+        FileExistsError: the folder exists, and `resume` is not set.
+        ValueError: it has other settings, or what it remembers is damaged.
+    """
     partial, total = config.partial_root, config.dataset.num_episodes
     starts = shard_starts(total)
     settings = {
@@ -531,13 +541,23 @@ def plan_shards(config: RecordConfig) -> list[Shard]:
     settings_file = partial / "settings.json"
     if partial.exists() and not config.resume:
         raise FileExistsError(f"{partial} holds an interrupted recording: go on with --resume=true, or delete it")
-    if settings_file.exists() and json.loads(settings_file.read_text()) != settings:
+    if not settings_file.exists():
+        partial.mkdir(parents=True, exist_ok=True)
+        _write_whole(settings_file, json.dumps(settings, indent=2))
+    elif _read_settings(settings_file) != settings:
         raise ValueError(f"{settings_file} has other settings than this command: use the same ones to resume")
-    partial.mkdir(parents=True, exist_ok=True)
-    settings_file.write_text(json.dumps(settings, indent=2))
     if len(starts) < config.num_workers:
         logging.warning(f"only {len(starts)} of {config.num_workers} workers have work: {total} episodes are few")
     return [Shard(partial / f"episodes_{start:06d}", start, min(start + starts.step, total)) for start in starts]
+
+
+def _read_settings(file: Path) -> dict[str, Any]:
+    try:
+        return json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(
+            f"{file} is damaged ({error}): delete it if the recording had the settings of this command, else its folder"
+        ) from error
 
 
 def shard_starts(num_episodes: int) -> range:

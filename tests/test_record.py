@@ -362,6 +362,13 @@ def test_an_interrupted_recording_goes_on_with_the_same_settings_only(tmp_path):
     ):
         with pytest.raises(ValueError, match="has other settings than this command"):
             record(replace(other, resume=True))
+    settings = config.partial_root / "settings.json"
+    written = settings.stat().st_mtime_ns
+    plan_shards(replace(config, resume=True))
+    assert settings.stat().st_mtime_ns == written
+    settings.write_text("")
+    with pytest.raises(ValueError, match=r"settings\.json is damaged .*: delete it if"):
+        plan_shards(replace(config, resume=True))
 
 
 @pytest.fixture
@@ -551,9 +558,11 @@ def test_a_task_without_an_expert_is_not_recorded(tmp_path, monkeypatch):
         ("--dataset.num_episodes=0", "must be at least 1"),
         ("--seed=-1", "--seed must be at least 0, got -1"),
         ("--dataset.root=/dev/null/dataset", "Not a directory"),
+        ("--dataset.root=.", "exists already: delete it, or choose another"),
     ],
 )
 def test_bad_flags_are_one_line_and_leave_nothing_behind(tmp_path, monkeypatch, flag, message):
+    monkeypatch.chdir(tmp_path)
     flags = ("--dataset.repo_id=t/t", f"--dataset.root={tmp_path / 'nothing'}", flag)
     monkeypatch.setattr(sys, "argv", ["hdp-record", *flags])
     monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
