@@ -449,11 +449,7 @@ def _upload_if_wanted(config: RecordConfig, dataset: LeRobotDataset) -> None:
     if not config.dataset.push_to_hub:
         return
     try:
-        dataset.push_to_hub(
-            tags=[*CARD_TAGS, *config.dataset.tags],
-            private=config.dataset.private,
-            dataset_description=describe(config.env.planning_task, dataset),
-        )
+        dataset.push_to_hub(private=config.dataset.private, **describe_dataset(config, dataset))
     except Exception as error:  # of the Hub's client, of HTTP, of the transfer: nothing is lost by any
         reason = " ".join(str(error).split())
         raise OSError(
@@ -586,12 +582,7 @@ def _merge(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) ->
     recording = {"seed": config.seed, "num_episodes": config.dataset.num_episodes, "failed_attempts": failed}
     (merged / RECORDING_PATH).write_text(json.dumps(recording, indent=4, sort_keys=True))
     dataset = LeRobotDataset(repo_id, root=merged, video_backend="pyav")
-    card = create_lerobot_dataset_card(
-        tags=[*CARD_TAGS, *config.dataset.tags],
-        dataset_info=dataset.meta.info,
-        license="apache-2.0",
-        dataset_description=describe(config.env.planning_task, dataset),
-    )
+    card = create_lerobot_dataset_card(dataset_info=dataset.meta.info, **describe_dataset(config, dataset))
     card.save(merged / "README.md")
     config.root.parent.mkdir(parents=True, exist_ok=True)
     merged.rename(config.root)
@@ -600,6 +591,17 @@ def _merge(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) ->
 
 
 CARD_TAGS = ["hybrid-diffusion-planning", "symbolic-plan", "simulation"]
+PAPER = "https://doi.org/10.1109/LRA.2026.3664616"
+
+
+def describe_dataset(config: RecordConfig, dataset: LeRobotDataset) -> dict[str, Any]:
+    """What the dataset's card says, on disk and on the Hub."""
+    return {
+        "tags": [*CARD_TAGS, *config.dataset.tags],
+        "license": "apache-2.0",
+        "paper": PAPER,
+        "dataset_description": describe(config.env.planning_task, dataset),
+    }
 
 
 def describe(task: PlanningTask, dataset: LeRobotDataset) -> str:

@@ -102,8 +102,9 @@ def test_the_plan_column_is_what_remains(recorded):
     assert np.array_equal(plans[:, 7, :12], plans[:, 0, 6:])
 
 
-def test_the_card_shows_a_plan_in_words(dataset_root):
+def test_the_card_shows_a_plan_in_words_and_names_the_paper(dataset_root):
     card = (dataset_root / "README.md").read_text()
+    assert "**Paper:** https://doi.org/10.1109/LRA.2026.3664616" in card
     assert "PICK" in card
     assert "PLACE" in card
     assert "hybrid-diffusion-planning" in card
