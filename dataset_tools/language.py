@@ -25,7 +25,7 @@ DONE_TEXT = "done"
 """Text of both styles once nothing is left to do."""
 
 
-def write_language_columns(root: Path, vocabulary: Sequence[str]) -> None:
+def write_language_columns(root: Path | str, vocabulary: Sequence[str]) -> None:
     """Add the language columns to a dataset on disk, from its column `observation.symbolic_plan`.
 
     Args:
@@ -35,6 +35,7 @@ def write_language_columns(root: Path, vocabulary: Sequence[str]) -> None:
     Raises:
         ValueError: the dataset has no symbolic plans, or language columns already.
     """
+    root = Path(root)
     info = load_info(root)
     if SYMBOLIC_PLAN not in info.features:
         raise ValueError(f"{root} has no column {SYMBOLIC_PLAN}: add_symbolic_plans makes one")

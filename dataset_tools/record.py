@@ -411,8 +411,7 @@ def _record(config: RecordConfig) -> LeRobotDataset:
     with tqdm(total=config.dataset.num_episodes, desc=f"Recording {config.env.task}", unit="episode") as progress:
         if config.num_workers == 1:
             for shard in shards:
-                if is_complete(shard):
-                    progress.update(shard.stop - shard.start)
+                progress.update(recorded_episodes(shard))
                 record_shard(config, shard, progress)
         else:
             context = multiprocessing.get_context("forkserver")
@@ -434,7 +433,12 @@ def _record(config: RecordConfig) -> LeRobotDataset:
 
 
 def merge_shards(config: RecordConfig, shards: list[Shard]) -> LeRobotDataset:
-    """Make one dataset of the shards, remove them, and upload the dataset if that is wanted."""
+    """Make one dataset of the shards, remove them, and upload the dataset if that is wanted.
+
+    Raises:
+        ValueError: they are not all episodes of the recording.
+        OSError: the upload failed.
+    """
     failed = {episode: attempts for shard in shards for episode, attempts in failed_attempts(shard).items()}
     dataset = _merge(config, shards, failed)
     dropped, attempts = sum(failed.values()), config.dataset.num_episodes + sum(failed.values())
@@ -561,9 +565,14 @@ def shard_starts(num_episodes: int) -> range:
     return range(0, num_episodes, min(EPISODES_PER_SHARD, max(1, num_episodes // FEWEST_SHARDS)))
 
 
+def recorded_episodes(shard: Shard) -> int:
+    """How many episodes a shard on disk holds; one that was killed while it was written begins again."""
+    return load_info(shard.root).total_episodes if shard.done_file.exists() else 0
+
+
 def is_complete(shard: Shard) -> bool:
     """Whether a shard holds all of its episodes."""
-    return shard.done_file.exists() and load_info(shard.root).total_episodes == shard.stop - shard.start
+    return recorded_episodes(shard) == shard.stop - shard.start
 
 
 def failed_attempts(shard: Shard) -> dict[int, int]:
@@ -582,6 +591,11 @@ def _merge(config: RecordConfig, shards: list[Shard], failed: dict[int, int]) ->
     recording = {"seed": config.seed, "num_episodes": config.dataset.num_episodes, "failed_attempts": failed}
     (merged / RECORDING_PATH).write_text(json.dumps(recording, indent=4, sort_keys=True))
     dataset = LeRobotDataset(repo_id, root=merged, video_backend="pyav")
+    if dataset.num_episodes != config.dataset.num_episodes:
+        raise ValueError(
+            f"{config.partial_root} has {dataset.num_episodes} of {config.dataset.num_episodes} episodes: go on with "
+            "--resume=true"
+        )
     card = create_lerobot_dataset_card(dataset_info=dataset.meta.info, **describe_dataset(config, dataset))
     card.save(merged / "README.md")
     config.root.parent.mkdir(parents=True, exist_ok=True)

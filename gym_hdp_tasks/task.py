@@ -58,7 +58,7 @@ class PlanningTask:
     robot_type: str
     check_plan: Callable[[Sequence[str], Observation], list[str]] = field(compare=False)
     step_ends: tuple[tuple[int, int], ...] | None = None
-    parameters: dict[str, Any] = field(default_factory=dict)
+    parameters: dict[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self):
         if self.vocabulary[0] != PAD:

@@ -35,6 +35,7 @@ from dataset_tools.record import (
     RecordDatasetConfig,
     demonstrate,
     episode_seed,
+    merge_shards,
     plan_shards,
     record,
     record_shard,
@@ -304,6 +305,8 @@ def test_the_command_goes_on_with_an_interrupted_recording_only_when_told_to(tmp
     config, flags = config_of(2, tmp_path / "stopped"), flags_of(2, tmp_path / "stopped")
     first_shard, _ = plan_shards(config)
     record_shard(config, first_shard)
+    with pytest.raises(ValueError, match=r"stopped\.partial has 1 of 2 episodes: go on with --resume=true"):
+        merge_shards(config, [first_shard])
     monkeypatch.setattr(recorder, "exit_when_terminated", lambda: None)
     with pytest.raises(SystemExit, match="--resume=true") as end:
         call_command(recorder.main, *flags)
@@ -386,7 +389,7 @@ def not_ignored():
     ("signal_number", "exception"),
     [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit), (signal.SIGHUP, SystemExit)],
 )
-def test_a_signal_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch, signal_number, exception):
+def test_a_signal_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch, capsys, signal_number, exception):
     monkeypatch.setattr(recorder, "FEWEST_SHARDS", 1)
     config, save_episode = config_of(5, tmp_path / "stopped"), LeRobotDataset.save_episode
 
@@ -402,6 +405,8 @@ def test_a_signal_while_an_episode_is_written_waits_for_it(tmp_path, monkeypatch
             record(config)
     assert load_info(tmp_path / "stopped.partial/episodes_000000").total_episodes == 3
     assert record(replace(config, resume=True)).num_episodes == 5
+    *_, bar = (part for part in capsys.readouterr().err.split("\r") if part.startswith("Recording"))
+    assert " 5/5 " in bar
 
 
 @pytest.mark.usefixtures("not_ignored")

@@ -140,7 +140,7 @@ def test_language_columns_say_which_step_is_being_done(dataset, expert_steps):
             assert [line.split(". ")[-1] for line in plan.splitlines()] == left
             assert frame["language_events"] == []
     with pytest.raises(ValueError, match="already"):
-        write_language_columns(dataset.root, SORTING.planning_task.vocabulary)
+        write_language_columns(str(dataset.root), SORTING.planning_task.vocabulary)
 
 
 def test_plans_are_made_of_subtasks(dataset, expert_steps):

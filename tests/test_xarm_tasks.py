@@ -42,6 +42,7 @@ def test_sizes_are_the_papers(task, horizon, symbolic_horizon, vocabulary):
     assert len(facts.action_names) == 4
     env = gym.make(facts.gym_id, disable_env_checker=True, **facts.parameters).unwrapped
     assert env.planning_task == facts
+    assert hash(env.planning_task) == hash(facts)
     observation, _ = env.reset(seed=0)
     assert observation["environment_state"].shape == (len(facts.environment_state_names),)
     assert observation["agent_pos"].shape == (len(facts.state_names),)
