@@ -203,12 +203,12 @@ What helps is more demonstrations; or, with the same ones, `observation_noise`, 
 by less than about two centimetres while the plan is decided. At the end of the training, 93 and 99 of 100 plans are
 valid with it (two seeds), with more weight decay, too, 98, with that alone 87, and without either 81 to 89 (three
 seeds). Then training twice as long pays: of the last five evaluations, all plans are valid in three, and 96 of 100 or
-more in the others. It does not help Separate: 68 of 100 plans are valid with it, and 67 to 76 without (three seeds). In
-tool use, HDP has 100 % with it as without; in arranging, from 4,000 demonstrations, 94 % where it has 98 and 99 without
-(two seeds), and fails by its plan alone: which slot another block leaves no room to reach may be a matter of
-centimetres. So no preset has it. (All that has noise or weight decay was trained in float32, the others in bfloat16,
-which made waypoints and poses coarser than it does now. `dtype=float32` is that alone: it gains nothing, and 86 of 100
-plans are valid with it.)
+more in the others. Separate gains nothing from it in as many steps: 68 of 100 plans are valid with it, and 67 to 76
+without (three seeds); after twice as many, 87, 91 and 82 in the last three evaluations. In tool use, HDP has 100 % with
+it as without; in arranging, from 4,000 demonstrations, 94 % where it has 98 and 99 without (two seeds), and fails by
+its plan alone: which slot another block leaves no room to reach may be a matter of centimetres. So no preset has it.
+(All that has noise or weight decay was trained in float32, the others in bfloat16, which made waypoints and poses
+coarser than it does now. `dtype=float32` is that alone: it gains nothing, and 86 of 100 plans are valid with it.)
 
 """
 ABOUT_DIFFUSER = """
