@@ -39,7 +39,7 @@ def check_token_ids(config: HDPConfig, stats: dict[str, Any]) -> None:
     """Whether the dataset's plans hold symbols alone, as far as its statistics say.
 
     Raises:
-        ValueError: there are token ids of none.
+        ValueError: there are other token ids.
     """
     if config.symbol_process is None or OBS_SYMBOLIC_PLAN not in stats:
         return
