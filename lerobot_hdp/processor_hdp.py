@@ -23,6 +23,8 @@ NARROWEST_RANGE = 0.1
 """What `widen_narrow_ranges` leaves of the widest range."""
 RANGE_OF_CONSTANT = 1.0
 """What it takes for half of the range of an observation that never varies."""
+BRIGHTEST = 2.0
+"""Of an image in [0, 1], with room for what resizing and augmentation add."""
 
 
 @ProcessorStepRegistry.register(name="hdp_observation_shapes")
@@ -35,7 +37,8 @@ class ObservationShapesProcessorStep(ObservationProcessorStep):
             nothing is said here.
 
     Raises:
-        ValueError: an observation is missing, is no tensor, has another shape, or is an image of whole numbers.
+        ValueError: an observation is missing, is no tensor, has another shape, or is an image of whole numbers or, on
+            a CPU, far above 1.
     """
 
     shapes: dict[str, list[int | None]] = field(default_factory=dict)
@@ -47,8 +50,8 @@ class ObservationShapesProcessorStep(ObservationProcessorStep):
             if not isinstance(observation[key], Tensor):
                 kind = type(observation[key]).__name__
                 raise ValueError(f"{key} is a {kind}: make it a torch.Tensor, float32, which LeRobot's processors read")
-            if len(shape) == len("chw") and observation[key].dtype == torch.uint8:
-                raise ValueError(f"{key} is uint8: make it float32 in [0, 1], as image.float() / 255")
+            if len(shape) == len("chw"):
+                _check_image(key, observation[key])
             found = list(observation[key].shape[-len(shape) :])
             fits = all(wanted in (None, size) for wanted, size in zip(shape, found, strict=False))
             if shape != [1] and not (fits and len(found) == len(shape)):
@@ -62,6 +65,15 @@ class ObservationShapesProcessorStep(ObservationProcessorStep):
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         return features
+
+
+def _check_image(key: str, image: Tensor) -> None:
+    remedy = "make it float32 in [0, 1], as image.float() / 255"
+    if image.dtype == torch.uint8:
+        raise ValueError(f"{key} is uint8: {remedy}")
+    # On a GPU the host would wait for the answer at every training step.
+    if image.device.type == "cpu" and image.numel() and (brightest := image.max().item()) > BRIGHTEST:
+        raise ValueError(f"{key} has values of up to {brightest:g}: {remedy}")
 
 
 @ProcessorStepRegistry.register(name="hdp_symbolic_plan")

@@ -213,6 +213,8 @@ def test_images_of_any_size_are_resized(dataset):
         preprocessor({FRONT: image[:, :1]})
     with pytest.raises(ValueError, match=r"front is uint8: make it float32 in \[0, 1\]"):
         preprocessor({FRONT: (255 * image).to(torch.uint8)})
+    with pytest.raises(ValueError, match=r"front has values of up to 2\d\d: make it float32 in \[0, 1\]"):
+        preprocessor({FRONT: (255 * image).round()})
 
 
 def test_pretrained_weights_keep_their_batch_statistics(make_planner, tmp_path, monkeypatch):
